@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab.studies.atlas import Atlas as Atlas
     from jumplab.studies.chain import run_chain as run_chain
     from jumplab.studies.envelope import envelope as envelope
+    from jumplab.studies.record import record as record
     from jumplab.studies.trials import run_trials as run_trials
     from jumplab.task import JumpTask as JumpTask
 
@@ -78,6 +79,7 @@ _PLACES = {
     "run_trials": "studies.trials",
     "run_chain": "studies.chain",
     "envelope": "studies.envelope",
+    "record": "studies.record",
 }
 _MODULES = {"errors": "errors", "plots": "show"}
 Shown.pictures = lambda: import_module("jumplab.show.cards")

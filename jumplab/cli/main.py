@@ -30,6 +30,7 @@ from jumplab.cli.studies import (
     clips,
     envelope,
     margins,
+    record,
     sweep,
     trials,
 )
@@ -49,7 +50,7 @@ def completion(args: argparse.Namespace) -> None:
 
 COMMANDS = (run, plan, audit, simulate, trials, margins, certify, chain, clips, judge, mend)
 COMMANDS += (view, export)
-COMMANDS += (robot, envelope, atlas, sweep, bench, completion)
+COMMANDS += (robot, record, envelope, atlas, sweep, bench, completion)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -29,9 +29,11 @@ from jumplab.errors import InfeasibleError, InputError
 from jumplab.io.progress import tell
 from jumplab.task import JumpTask
 
+api = Late("api")
 certificate_pages = Late("show.certificate")
 pictures = Late("show.maps")
 
+TARGET = "distance_m", "height_m", "platform_m", "side_m", "yaw_rad", "gravity"
 CAPTION = "Cells with a plan of the direct planner, coloured by the limit of which they use most."
 ASKED = {"foot_distance_m": "distance_m", "com_rise_m": "height_m"}  # metrics by another name
 
@@ -246,6 +248,36 @@ def envelope(args: Namespace) -> None:
     for word, cell in (("highest", envelope.highest), ("farthest", envelope.farthest)):
         jump = style.describe_task(cell.task)
         print(f"{word}: {jump}, limited by {cell.limiting} ({100 * cell.share:.0f} % used)")
+
+
+def record(args: Namespace) -> None:
+    """How far a robot can go in one number of the target, what ends it, what more would buy."""
+    robot = robots.Robot.load(args.robot)
+    numbers = {name: getattr(args, name) for name in TARGET if getattr(args, name) is not None}
+    task = None
+    if numbers:
+        task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers)
+    if args.out:
+        store.ensure_writable(args.out)
+    options = given(studies.record.record, args, robot=robot, given=task)
+    found = studies.record.record(**options)
+    args.found["record"] = {"what": found.what, "value": found.value, "unit": found.unit}
+    args.found["record"] |= {"found": found.found, "limits": [asdict(x) for x in found.limits]}
+    args.found["record"]["landed"] = {name: run.landed for name, run in found.runs.items()}
+    print(found.line())
+    print(f"audit: {found.audit.line()}")
+    for name, run in found.runs.items():
+        print(f"at {found.share:.0%} of it in {name}: {run.line()}")
+    columns = ("limit", "joint", "phase", "from_s", "to_s", "worth")
+    print(tables.table([asdict(x) for x in found.limits], columns, digits=3))
+    if args.prices:
+        prices = found.prices()
+        args.found["prices"] = [asdict(row) for row in prices.rows]
+        print(tables.table([asdict(row) | {"gap": row.gap} for row in prices.rows], digits=3))
+        print(prices.line())
+    if args.out:
+        api.save(args.out, found.plan)
+        print(f"the plan at the record is in {args.out}")
 
 
 def atlas(args: Namespace) -> None:

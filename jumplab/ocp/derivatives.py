@@ -211,11 +211,14 @@ class Formulator:
         nx = len(phase.node_scales)
         q, v, a, z = ca.vertsplit(ca.DM(phase.node_scales) * state, [0, *phase.ends, nx])
         duration, *values = ca.vertsplit(ca.DM(phase.constant_scales) * constants)
-        names = SimpleNamespace(**dict(zip(phase.constants, values, strict=True)))
+        constants = dict(zip(phase.constants, values, strict=True))
+        given = vars(self._parameters)
+        given = given | {name: x for name, x in constants.items() if name in given}
         edges = np.cumsum([0, *phase.references.values()]).tolist()
         columns = [refs[i:k] for i, k in pairwise(edges)]
         ref = SimpleNamespace(**dict(zip(phase.references, columns, strict=True)))
-        return Point(q, v, a, None, z, duration, s, names, self._parameters, ref, view=phase.view)
+        names, parameters = SimpleNamespace(**constants), SimpleNamespace(**given)
+        return Point(q, v, a, None, z, duration, s, names, parameters, ref, view=phase.view)
 
     def _within(self, phase: Phase) -> tuple:
         """Variables of a node and of a step, data, and what terms at each place see and span, of

@@ -283,3 +283,32 @@ def pack_multipliers(a: Assembled, given: Multipliers) -> tuple[np.ndarray, np.n
         if known is not None and known[1].shape[1:] == index.shape[1:]:
             lam[which][index] = resampled(*known, share) / density
     return lam
+
+
+def binding(
+    a: Assembled, posed: Posed, given: Multipliers
+) -> Iterator[tuple[tuple[str, str], int, np.ndarray, np.ndarray, np.ndarray]]:
+    """((owner, term name), column, shares of the phase (K,), multipliers (K,), limits (K,)) of all
+    limits, as scaled; zero where both bounds are one, so that nothing could give way.
+    """
+    for name, which, index, share, density in _along(a):
+        low, high = (bounds[index] for bounds in (posed.box, posed.rows)[which])
+        lam = np.where(low < high, given.rows[name][1] / density, 0.0)
+        for c in range(lam.shape[1]):
+            yield name, c, share, lam[:, c], np.where(lam > 0, high, low)[:, c]
+
+
+def lagrangian(a: Assembled, posed: Posed, x: np.ndarray, given: Multipliers) -> float:
+    """Cost and limits, these times ``given`` multipliers, at the variables ``x`` (size,), scaled.
+
+    At a solution it is the cost; with other numbers in ``posed`` it changes as the least cost does,
+    to first order.
+    """
+    f, g = (y.full().ravel() for y in a.nlp(x, posed.p))
+    total = float(f[0])
+    lam_x, lam_g = pack_multipliers(a, given)
+    for lam, y, (low, high) in ((lam_x, x, posed.box), (lam_g, g, posed.rows)):
+        end = np.where(lam > 0, high, low)
+        kept = (lam != 0) & np.isfinite(end)
+        total += float(lam[kept] @ (y - end)[kept])
+    return total

@@ -184,7 +184,8 @@ class Phase:
     terms, bounds : costs, constraints and boxes.
     states : names of further node variables, tied by "interval" terms.
     constants : name -> (lower, upper, scale), unknown constants of the phase besides its duration;
-        with a fourth entry, a key: constants of the same key are one unknown in all phases.
+        with a fourth entry, a key: constants of the same key are one unknown in all phases. One
+        with the name of a parameter takes its place in the terms of the phase.
     references : name -> size, data given per node when solving.
     scales : nominal sizes of q, v, a, j and z; 1 where not given.
     view : makes of a :class:`Point` an object with the quantities that people think in, one

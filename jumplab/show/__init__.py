@@ -29,7 +29,7 @@ _NAMES = {  # module: its public names, loaded when they are first used
     "movies": "Movie movie",
     "certificate": "certificate_page",
     "tables": "Table table versions",
-    "cards": "card clip_sheet Plots",
+    "cards": "card clip_sheet price_bars Plots",
     # helpers: bodies, with the sheet of a robot; curves, colours and saving
     "bodies": """robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points
         draw_ground draw_path draw_com equal_scales""",

@@ -38,8 +38,11 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import SimulationResult
     from jumplab.studies.margins import MarginReport
     from jumplab.studies.mend import Mended
+    from jumplab.studies.record import Prices, Record
     from jumplab.studies.trials import TrialReport
 
+MOST_BINDING = 12  # limits of a record that are shown, the dearest
+MOST_PRICES = 14  # and prices
 Card = tuple[Table, Picture | None]
 
 
@@ -156,6 +159,43 @@ def _of_mended(mended: Mended) -> Card:
     return rows, jump_strobe(mended.plan.tape, mended.plan.robot)
 
 
+def _of_record(record: Record) -> Card:
+    rows = [vars(limit) | {"worth": limit.worth} for limit in record.limits[:MOST_BINDING]]
+    columns = {"limit": "binds", "joint": "joint", "phase": "phase", "from_s": "from [s]"}
+    columns |= {"to_s": "to [s]", "worth": "worth of all of it"}
+    return table(rows, columns, digits=3), jump_strobe(record.plan.tape, record.plan.robot)
+
+
+def _of_prices(prices: Prices) -> Card:
+    rows = [vars(row) | {"gap": f"{row.gap:.1%}"} for row in prices.rows]
+    columns = {"limit": "limit", "unit": "for one", "price": f"buys [{prices.unit}]"}
+    columns |= {"checked": "moved and sought again", "gap": "differs", "stays": "same limits bind"}
+    return table(rows, columns, digits=3), price_bars(prices)
+
+
+@styled
+def price_bars(prices: Prices) -> Figure:
+    """What one per cent more of each limit (a degree, 0.01 of friction) buys, with the records that
+    check it; hollow where other limits take over.
+    """
+    rows = prices.rows[:MOST_PRICES][::-1]
+    fig = new_figure(PAGE_IN, 0.7 + 0.22 * len(rows))
+    ax = fig.subplots()
+    size = 1e3 if prices.unit == "m" else 180 / np.pi
+    names = [f"{row.limit}, {row.step_words}" for row in rows]
+    ax.barh(names, [size * row.price * row.step for row in rows], color=LAUNCH)
+    for kept, face in ((True, FLIGHT), (False, "white")):
+        at = [(size * row.checked * row.step, k) for k, row in enumerate(rows) if row.stays == kept]
+        look = dict(linestyle="none", marker="o", markersize=4, color=FLIGHT, zorder=3)
+        label = "sought again" if kept else "sought again, others bind"
+        ax.plot(*np.array(at).reshape(-1, 2).T, markerfacecolor=face, label=label, **look)
+    ax.axvline(0, **LIMIT_STYLE)
+    ax.legend(loc="best")
+    unit = "mm" if prices.unit == "m" else "deg"
+    ax.set(xlabel=f"buys [{unit}]", title=f"{prices.robot}: what more of a limit buys")
+    return fig
+
+
 def _of_trials(report: TrialReport) -> Card:
     return table(report.rows()), _scatter(report)
 
@@ -184,6 +224,8 @@ CARDS: Mapping[str, Callable[[Any], Card]] = {
     "AuditReport": _of_audit,
     "ClipReport": _of_clip,
     "Mended": _of_mended,
+    "Record": _of_record,
+    "Prices": _of_prices,
     "TrialReport": _of_trials,
     "MarginReport": _of_margins,
 }

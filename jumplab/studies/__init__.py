@@ -18,6 +18,7 @@ __getattr__, __dir__, __all__ = lazy.attach(
         "envelope",
         "grid",
         "margins",
+        "record",
         "study",
         "sweep",
         "trials",

@@ -48,6 +48,7 @@ class WholeBodyPlan(Shown):
     def of(cls, program: Program, task: JumpTask, solved: Solved, start: str) -> WholeBodyPlan:
         """The plan that a solution is, with its tape (1 kHz); ``start`` led to it."""
         robot = program.robot
+        task = program.found(task, solved)
         surface = program.surface(task)
         phases = solved.phases
         tape = make_tape(solved.schedule.whole, phases, task.gravity)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
@@ -23,7 +24,7 @@ from jumplab.stages.whole_body.contacts import Contacts, jump_contacts
 from jumplab.stages.whole_body.coordinates import Coordinates, even, in_plane, whole
 from jumplab.stages.whole_body.motions import Motion, configurations
 from jumplab.stages.whole_body.plan import WholeBodyPlan
-from jumplab.stages.whole_body.program import Program
+from jumplab.stages.whole_body.program import Program, Solved
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.starts import (
     ASIDE,
@@ -86,6 +87,7 @@ class WholeBodyPlanner:
         self.free = free or (even(self.body) if tracking else whole(self.body))
         given = self.body, self.contacts, limits, weights, self.free, tracking, changes
         self.usual = Program(*given, options, keep, follows)
+        self._sought: dict[tuple, Program] = {}
 
     @cached_property
     def _even(self) -> Program | None:
@@ -144,6 +146,7 @@ class WholeBodyPlanner:
         near: WholeBodyPlan | Mapping[str, PhaseGuess] | None = None,
         stance: np.ndarray | None = None,
         starts: Sequence[Start] | None = None,
+        sought: tuple[str, ...] = (),
     ) -> WholeBodyPlan:
         """Solve for a target, from one start after the other, up to the first motion that keeps
         every limit.
@@ -157,6 +160,8 @@ class WholeBodyPlanner:
         stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's
             places; it if None.
         starts : instead of the usual list.
+        sought : parameters of the target that are unknowns, the first of which is maximised; their
+            values in ``task`` are where they begin.
 
         Where nobody reads why there is no plan, :data:`jumplab.ocp.nlp.EXPLAINED` is off, and it
         gives up sooner.
@@ -172,7 +177,7 @@ class WholeBodyPlanner:
         chart = None if stance is None else self.body.model.of_pinocchio(stance[None])[0]
         self._check_standing(task, chart)
         asked = Asked(task, chart, srmp, weights, near, begin, self._straight)
-        programs = self.programs(task, weights)
+        programs = [self.seeking(x, sought) for x in self.programs(task, weights)]
         plans = []
         failures = []
         for program in programs:
@@ -183,7 +188,7 @@ class WholeBodyPlanner:
                 if program.spent(asked):
                     break
                 try:
-                    plans.append(self._refined(program, asked, start))
+                    plans.append(self.refined(program, asked, start))
                 except (SolverError, InfeasibleError) as e:  # the jump straight ahead may have none
                     failures.append(e)
                     continue
@@ -203,6 +208,26 @@ class WholeBodyPlanner:
             stage=name,
         )
 
+    def solved(self, task: JumpTask) -> Solved:
+        """The first motion that keeps every limit at the nodes, without a look between them; raises
+        as :meth:`plan`.
+        """
+        self._check_standing(task, None)
+        asked = Asked(task, straight=self._straight)
+        program = self.program(task)
+        *starts, last = self._starts(program, asked, patient=False)
+        for start in starts:
+            with suppress(SolverError):
+                return program.solve(asked, start)
+        return program.solve(asked, last)
+
+    def seeking(self, program: Program, sought: tuple[str, ...]) -> Program:
+        """The same ``program`` with parameters of the target as unknowns, built once."""
+        key = program.free.kind, sought
+        if sought and key not in self._sought:
+            self._sought[key] = replace(program, sought=sought)
+        return self._sought[key] if sought else program
+
     def _starts(self, program: Program, asked: Asked, patient: bool) -> list[Start]:
         """The list of starts in a program, in their order; the last one only for who is
         ``patient``.
@@ -221,7 +246,7 @@ class WholeBodyPlanner:
             starts.sort(key=lambda x: (x.name != NEIGHBOUR, x.name == STANCE, x.held))
         return starts
 
-    def _refined(self, program: Program, asked: Asked, start: Start) -> WholeBodyPlan:
+    def refined(self, program: Program, asked: Asked, start: Start) -> WholeBodyPlan:
         """The plan of one start, its links apart.
 
         Where it passes limits between the nodes it is solved on: to the end, then on finer meshes.

@@ -21,7 +21,8 @@ from jumplab.stages.whole_body.instant import Instant
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
-from jumplab.stages.whole_body.terms import link_distance, phase_terms
+from jumplab.stages.whole_body.terms import largest, link_distance, phase_terms
+from jumplab.task import RANGES
 
 NAME = "whole body"
 SCALES = {"q": 1.0, "v": 10.0, "a": 100.0}  # peaks of solutions, for conditioning
@@ -34,6 +35,16 @@ TRACKED_IN_FLIGHT = {"rho": 1, "rho_rate": 1}  # references and their sizes
 TRACKED = {**TRACKED_IN_FLIGHT, "velocity": 2, "L": 1}
 PARAMETERS = dict(distance=1, side=1, yaw=1, platform=1, edge=1, along=2)
 PARAMETERS |= dict(takeoff_speed=1, rotation=1, gravity=1, straight=1)
+
+# parameters of the target that can be unknowns, each with a field of :class:`.JumpTask`; they go as
+# far as that does
+SOUGHT = {
+    "distance": "distance_m",
+    "side": "side_m",
+    "platform": "platform_m",
+    "yaw": "yaw_rad",
+    "takeoff_speed": "height_m",
+}
 
 
 class Schedule:
@@ -49,9 +60,13 @@ class Schedule:
         free: Coordinates | None = None,
         tracking: bool = False,
         follows: bool = False,
+        sought: tuple[str, ...] = (),
     ):
         """``apart`` has rows for links that met; ``free`` are all coordinates if None; with
-        ``tracking`` a jump follows stage 1's trajectories, or it ``follows`` a given motion."""
+        ``tracking`` a jump follows stage 1's trajectories, or it ``follows`` a given motion.
+        ``sought`` are parameters of the target that are unknowns (of :data:`SOUGHT`), the first
+        one as large as possible."""
+        self.sought = sought
         self.tracking = tracking
         self.follows = follows
         self.free = free or whole(body)
@@ -134,6 +149,8 @@ class Schedule:
             last=k == len(phases) - 1 and self.contacts.ends == "touchdown",
         )
         terms += [link_distance(mode, x, given.intervals) for x in self.apart if x.phase == k]
+        if self.sought and k == len(phases) - 1:
+            terms.append(largest(self.sought[0]))
         swinging = [side for side in self.free.sides if side not in mode.modes]
         references = {f"{SIDES[side]}_clearance": 1 for side in swinging}
         if self.tracking:
@@ -170,6 +187,9 @@ class Schedule:
             contact = self.contacts.contact_of(k, side)
             for x, (low, high) in zip(HOLD, self.foothold(contact), strict=True):
                 out[f"{SIDES[side]}_{x}"] = (low, high, 1.0, f"contact {contact} {x}")
+        for name in self.sought:
+            ends = (partial(_furthest, name, end) for end in RANGES[SOUGHT[name]][1:])
+            out[name] = (*ends, 1.0, f"target {name}")
         return out
 
     def foothold(self, contact: int) -> list[tuple[float, float]]:
@@ -269,3 +289,10 @@ class Schedule:
 
 def _stance(parameters):
     return parameters["stance"]
+
+
+def _furthest(name: str, end: float, parameters: Mapping) -> float:
+    """An ``end`` of the range of a target's number, as the parameter ``name``."""
+    if name == "takeoff_speed":
+        return float(np.sqrt(2 * parameters["gravity"] * end))
+    return end

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from jumplab.errors import Shown, SolverError
+from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import LEAST_S, Nlp, Solution, left_s
+from jumplab.ocp.posing import Posed, binding, lagrangian, pack, pose
 from jumplab.ocp.solution import PhaseSolution, resampled
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
@@ -25,11 +27,11 @@ from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.coordinates import Coordinates
 from jumplab.stages.whole_body.ground import Surface, surface_of_jump, surface_of_schedule
 from jumplab.stages.whole_body.motions import Motion
-from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.problem import SOUGHT, Schedule
 from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
 from jumplab.stages.whole_body.starts import APART, Asked, Beginning, Start, from_solved
-from jumplab.task import JumpTask
+from jumplab.task import RANGES, JumpTask
 
 # beyond, the cost moves by less than one in a million
 IPOPT = {"tol": 1e-3, "constr_viol_tol": 1e-5, "compl_inf_tol": 1e-4}
@@ -83,6 +85,7 @@ class Program(Shown):
     changes : own terms, weights and switches.
     options : of ipopt besides :data:`IPOPT`.
     keep : whether what was built is kept for later processes.
+    sought : parameters of the target that are unknowns, see :class:`.Schedule`.
     """
 
     body: Body
@@ -95,6 +98,7 @@ class Program(Shown):
     options: Mapping[str, Any] = field(default_factory=dict)
     keep: bool = False
     follows: bool = False
+    sought: tuple[str, ...] = ()
     _built: dict[tuple, Nlp] = field(default_factory=dict, init=False)
 
     @property
@@ -105,7 +109,7 @@ class Program(Shown):
     def schedule(self, apart: tuple[Apart, ...] = ()) -> Schedule:
         """Its schedule, with rows for links that met (none by default)."""
         given = self.body, self.contacts, self.limits, self.weights
-        return Schedule(*given, apart, self.free, self.tracking, self.follows)
+        return Schedule(*given, apart, self.free, self.tracking, self.follows, self.sought)
 
     @property
     def nlp(self) -> Nlp:
@@ -116,12 +120,12 @@ class Program(Shown):
         key = tuple((x.phase, x.first, x.last, x.pair.key, x.more_m) for x in apart)
         if key not in self._built:
             if len(self._built) > BUILT:
-                usual = self._built[()]
+                usual = {(): self._built[()]} if () in self._built else {}
                 self._built.clear()
-                self._built[()] = usual
+                self._built.update(usual)
             words = (
                 f"{self.robot.hash} {self.free.kind} {self.limits} {self.weights} {self.tracking} "
-                f"{self.follows}"
+                f"{self.follows} {self.sought}"
             )
             problem = self.changes.applied(self.schedule(apart).problem())
             self._built[key] = Nlp(problem, {}, words if self.keep else None)
@@ -135,9 +139,15 @@ class Program(Shown):
         )
         return replace(self, contacts=replace(self.contacts, phases=phases))
 
+    @property
+    def size(self) -> int:
+        """Number of variables, the same whatever links met."""
+        built = next(iter(self._built.values()), None) or self.nlp
+        return built.assembled.size
+
     def left_s(self, asked: Asked) -> float:
         """Processor time [s] that further attempts of a program of this size may take."""
-        usual = PATIENCE_S * max(1.0, self.nlp.assembled.size / USUAL_SIZE)
+        usual = PATIENCE_S * max(1.0, self.size / USUAL_SIZE)
         return min(usual - asked.spent_s, left_s())
 
     def spent(self, asked: Asked) -> bool:
@@ -152,18 +162,22 @@ class Program(Shown):
         sentence names the terms in conflict where it shall ``explain``.
         """
         begin = begin or start.begin(self, asked)
-        most = start.patience * ITERATION_S * self.nlp.assembled.size / USUAL_SIZE
+        built = self._nlp(begin.apart)
+        most = start.patience * ITERATION_S * self.size / USUAL_SIZE
         left = max(LEAST_S, min(most, self.left_s(asked)))
         limit = {"max_iter": start.patience, "max_cpu_time": left}
         options = {**IPOPT, **start.options, **limit, **self.options}
-        nlp = self._nlp(begin.apart).with_options(options, HOLD if start.held else None)
+        nlp = built.with_options(options, HOLD if start.held else None)
+        parameters = self.parameters(asked.task, asked.stance, asked.srmp)
+        known = {name: parameters[name] for name in self.sought}
+        guess = {k: replace(x, constants=known | x.constants) for k, x in begin.guess.items()}
         began = time.process_time()
         try:
             solution = nlp.solve(
-                self.parameters(asked.task, asked.stance, asked.srmp),
-                begin.guess,
+                parameters,
+                guess,
                 references=self.references(asked.srmp, asked.motion),
-                weights=self.changes.spread(self.nlp.problem, asked.weights),
+                weights=self.changes.spread(nlp.problem, asked.weights),
                 multipliers=begin.multipliers,
                 explain=explain,
             )
@@ -201,6 +215,37 @@ class Program(Shown):
         model = self.body.model
         left = {k for k in model.left_half if model.across[k] is None}
         return [x for x in met if left & {x.pair.first.body, x.pair.second.body}]
+
+    def limits_of(self, asked: Asked, solved: Solved) -> Iterator[tuple]:
+        """What binds in a ``solved`` motion, see :func:`jumplab.ocp.posing.binding`."""
+        a, posed, _ = self._posed(asked, solved)
+        return binding(a, posed, solved.solution.multipliers)
+
+    def cost_of(self, asked: Asked, solved: Solved) -> float:
+        """What the least cost is, to first order, where ``solved`` is of a program like this one
+        with other numbers; see :func:`jumplab.ocp.posing.lagrangian`.
+        """
+        a, posed, guess = self._posed(asked, solved)
+        return lagrangian(a, posed, pack(a, guess), solved.solution.multipliers)
+
+    def _posed(self, asked: Asked, solved: Solved) -> tuple[Assembled, Posed, dict]:
+        """The problem of a solution, its numbers, and the solution as a start."""
+        a = self._nlp(solved.schedule.apart).assembled
+        guess = solved.solution.guess()
+        parameters = self.parameters(asked.task, asked.stance, asked.srmp)
+        weights = self.changes.spread(a.problem, asked.weights)
+        references = self.references(asked.srmp, asked.motion)
+        return a, pose(a, parameters, guess, references, weights), guess
+
+    def found(self, task: JumpTask, solved: Solved) -> JumpTask:
+        """The target that a solution has reached: ``task`` with what was sought."""
+        if not self.sought:
+            return task
+        found = next(iter(solved.solution.phases.values())).constants
+        new = {SOUGHT[name]: found[name] for name in self.sought}
+        if "takeoff_speed" in self.sought:
+            new["height_m"] = new["height_m"] ** 2 / (2 * task.gravity)
+        return replace(task, **{k: float(np.clip(x, *RANGES[k][1:])) for k, x in new.items()})
 
     # numbers of a target
     # ------------------------------------------------------------------------------------------

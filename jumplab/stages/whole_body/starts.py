@@ -207,6 +207,11 @@ APART = (
     Start("links apart", from_neighbour, True, 80, MET),
     Start("links apart", from_neighbour, False, 120, MET),
 )
+# to a record from an easy jump: to the end, or its prices would be rounding
+EXACT = {"acceptable_iter": 0, "tol": 1e-4}
+FAR_OFF = {"mu_init": 0.1, "mu_strategy": "monotone"}  # adaptive, it ends sooner, and lower
+SEEKING = Start("easy jump", from_neighbour, False, 300, WARM | EXACT | FAR_OFF)
+RECORD = Start("record", from_neighbour, False, 150, WARM | EXACT | {"mu_init": 1e-4})
 SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
 FINER = Start("finer mesh", from_neighbour, False, 150, WARM | {"acceptable_iter": 1})
 REFINED = (SETTLED, FINER, FINER)

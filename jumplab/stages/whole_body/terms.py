@@ -31,6 +31,12 @@ PLACE_SCALE = 0.1  # [m]
 SOLE_SHARES = 0.0, 0.25, 0.5, 0.75, 1.0  # of the way from toes to heel
 TORSION_SLACK_M = 1e-4  # where a foot hardly carries both sides of the row vanish
 CAPTURE = "replaces WF-E2"
+TORQUE_SPEED = "torque-speed"  # the term of the motors' lines
+RECORD = "record"  # the term of what is largest
+FAR = 100.0  # [m, m/s, rad] beyond any of it, so that its cost is nearly a straight line
+# of one of these units of it, in units of the effort: with more of it, motions leave the physics
+# between the nodes
+WORTH = 1000.0
 
 CLEAR = {"scale": PLACE_SCALE, "group": "clearance"}
 
@@ -113,7 +119,7 @@ def motor_lines(m: Mode, skip: tuple[int, int]) -> Term:
     def line(p):
         return (p.motor_torques + ca.DM(slope) * p.rates) / ca.DM(motors.effort)
 
-    words = "torque-speed", "ours: motor line", "of the effort", "node"
+    words = TORQUE_SPEED, "ours: motor line", "of the effort", "node"
     return Term(*words, line, lower=-most, upper=most, skip=skip)
 
 
@@ -200,6 +206,14 @@ def link_distance(m: Mode, kept: Apart, intervals: int) -> Term:
         skip=(kept.first, intervals - kept.last),
         group=kept.pair.key,
     )
+
+
+def largest(name: str) -> Term:
+    """A parameter of the target that is an unknown is as large as can be: as close as can be to
+    :data:`FAR`, which no target reaches. Effort counts little beside it.
+    """
+    of = "ours: what is largest", "m, m/s, rad", "end"
+    return Term(RECORD, *of, lambda p: FAR - getattr(p.p, name), WORTH / (2 * FAR))
 
 
 # feet on the ground

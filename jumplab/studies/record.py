@@ -1,0 +1,569 @@
+"""How far a robot can go in one number of the target, what ends it, and what more of each limit
+would buy.
+
+The number is an unknown of the whole-body program and as large as can be. A local solver speaks,
+from several easy jumps: a record is what it found "at least".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from jumplab.arguments import checked
+from jumplab.auditing import AuditReport, audit
+from jumplab.errors import InfeasibleError, InputError, RobotError, Shown, SolverError, quoted
+from jumplab.io.progress import tell
+from jumplab.ocp.nlp import unexplained
+from jumplab.ocp.problem import Phase
+from jumplab.robot import Robot
+from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
+from jumplab.stages.plan import JumpPlan
+from jumplab.stages.planner import Planner
+from jumplab.stages.whole_body import Limits
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.coordinates import even, in_plane, whole
+from jumplab.stages.whole_body.problem import SOUGHT
+from jumplab.stages.whole_body.program import Program, Solved
+from jumplab.stages.whole_body.starts import RECORD, SEEKING, Asked, from_solved
+from jumplab.stages.whole_body.terms import FAR, TORQUE_SPEED, WORTH
+from jumplab.stages.whole_body.terms import RECORD as RECORD_TERM
+from jumplab.task import RANGES, JumpTask
+
+# easy jumps to begin with: (the number sought, rise), of the leg's length, or [rad]
+EASY = {
+    "height_m": ((0.06, 0.06), (0.2, 0.2), (0.4, 0.4)),
+    "distance_m": ((0.1, 0.06), (0.2, 0.2), (0.5, 0.3)),
+    "platform_m": ((0.06, 0.2), (0.15, 0.3)),
+    "side_m": ((0.1, 0.15), (0.3, 0.3)),
+    "yaw_rad": ((0.3, 0.12), (1.0, 0.3)),
+}
+# shares of the best that they led to, whose own plans, of least effort, are the next starts
+CLIMB = 0.6, 0.75, 0.9
+SAME = 0.01  # share of a record within which another start ended in it
+# shares of it, of which the first clean one counts
+STEPS_BACK = 1.0, 0.99, 0.98, 0.96, 0.93, 0.9, 0.85, 0.8, 0.7
+LESS = 0.05  # of the share of a record that is played next, where a robot falls
+TRIED = 5  # shares that are played
+NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds
+PLATFORM_ROOM_M = 0.1  # of a platform's distance, over the least that it takes
+BINDS = 1e-2  # [m, m/s, rad] that the whole of a limit is worth at least, to be named
+BINDING_SHARE = 0.05  # of its largest multiplier: from there to there it binds
+ACTIVE = 1e-3  # [m, m/s, rad] that a limit at a node is worth at least, to be one that binds
+MOST = 8  # limits of joints that are priced
+MOVED = 0.005  # share by which torques, speeds, masses and legs are moved
+RANGE_RAD = math.radians(0.5)
+STOPS = {"upper stop": 1, "lower stop": -1}
+END = {1: "upper", -1: "lower"}
+MOTOR = {"torque": ("effort", "N m"), "speed": ("speed", "rad/s")}
+SEEN = 2e-5  # [m, rad] of a record, which solves find again
+WHOLE_UNITS = "deg", "0.01"
+MORE = 1.01  # times the worth of what is sought, in the second of two records that make prices
+FRICTION_STEP = 0.005
+KINDS = {"plane": in_plane, "even": even, "whole": whole}  # of coordinates
+
+
+@dataclass(frozen=True)
+class Binding:
+    """A limit that ends a record.
+
+    Attributes
+    ----------
+    phase, limit, joint : where, of what sort, of which joint ("" if of none).
+    from_s, to_s : when, on the tape [s].
+    worth : of the whole limit, in the unit of what is sought (m/s for a rise).
+    """
+
+    phase: str
+    limit: str
+    joint: str
+    from_s: float
+    to_s: float
+    worth: float
+
+
+@dataclass(frozen=True)
+class Price:
+    """What more of a limit buys.
+
+    Attributes
+    ----------
+    limit, unit : of what, for how much of it ("N m", "0.01").
+    price : of that unit by the multipliers, in the unit of the record.
+    checked : the same by a record with the limit moved by ``moved`` units; nan if none was found.
+    stays : whether the same limits bind then; where others do, a price holds for less.
+    """
+
+    limit: str
+    unit: str
+    price: float
+    checked: float
+    moved: float
+    stays: bool
+
+    @property
+    def gap(self) -> float:
+        """By how much the check differs from the price, as a share of it; of the least that is
+        seen where it is next to nothing.
+        """
+        return abs(self.checked - self.price) / max(abs(self.price), SEEN / self.moved)
+
+    @property
+    def step(self) -> float:
+        """One per cent of the limit, in its unit; of an angle and of friction the unit itself."""
+        return 1.0 if self.unit in WHOLE_UNITS else self.moved * 0.01 / MOVED
+
+    @property
+    def step_words(self) -> str:
+        """That in words."""
+        return self.unit if self.unit in WHOLE_UNITS else f"1 % ({self.step:.2g} {self.unit})"
+
+
+@dataclass(frozen=True, repr=False)
+class Prices(Shown):
+    """The prices of a record, dearest first."""
+
+    what: str
+    robot: str
+    unit: str
+    rows: tuple[Price, ...]
+
+    def line(self) -> str:
+        """How many there are, and how well they are confirmed."""
+        kept = [row.gap for row in self.rows if row.stays]
+        return (
+            f"{self.robot}, {self.what}: {len(self.rows)} prices; of {len(kept)} limits, which may "
+            f"be moved without others taking over, the checks differ by {max(kept, default=0):.1%} "
+            f"at most"
+        )
+
+
+@dataclass(frozen=True, repr=False)
+class Record(Shown):
+    """The largest number of a target that was found for a robot.
+
+    Attributes
+    ----------
+    what, value : the field of :class:`.JumpTask`, and how large it is at least [m, rad].
+    plan, audit : a plan at the record, and its audit.
+    found : by the easy jump that each start was, the number in which it ended; nan for none.
+    limits : what ends it, the dearest first.
+    share, reserve, runs : a plan at this share of the record, played in each engine.
+    """
+
+    what: str
+    value: float
+    plan: JumpPlan
+    audit: AuditReport
+    found: Mapping[str, float]
+    limits: tuple[Binding, ...]
+    share: float
+    reserve: JumpPlan | None
+    runs: Mapping[str, SimulationResult]
+    program: Program
+    solved: Solved
+
+    @property
+    def unit(self) -> str:
+        """Of the record."""
+        return unit_of(self.what)
+
+    @property
+    def alike(self) -> int:
+        """Starts that ended within 1 % of the best."""
+        best = max(x for x in self.found.values() if x == x)
+        return sum(x >= (1 - SAME) * best for x in self.found.values())
+
+    def line(self) -> str:
+        """The record in a sentence."""
+        word = self.what.rpartition("_")[0]
+        ends = list(dict.fromkeys(f"{x.joint} {x.limit}".strip() for x in self.limits))[:3]
+        landed = [name for name, run in self.runs.items() if run.landed]
+        played = f", lands at {self.share:.0%} of it in {' and '.join(landed) or 'no engine'}"
+        return (
+            f"{self.plan.robot.name}: {word} at least {self.value:.3f} {self.unit} "
+            f"({self.alike} of {len(self.found)} starts within 1 %), ends by "
+            f"{', '.join(ends)}{played * bool(self.runs)}"
+        )
+
+    def prices(self, most: int = MOST) -> Prices:
+        """What more of the ``most`` dearest limits of joints would buy, and of friction, mass and
+        legs; each checked by a record with it moved, which takes a second or two.
+        """
+        return _priced(self, most)
+
+
+@checked
+def record(
+    robot: Robot | str,
+    what: str = "height_m",
+    given: JumpTask | None = None,
+    *,
+    share: float = 0.95,
+    engines: Sequence[str] = INSTALLED,
+    **changes: Any,
+) -> Record:
+    """The largest ``what`` of a target that a plan was found for, and what ends it.
+
+    Parameters
+    ----------
+    robot : who jumps, or what :meth:`Robot.load` takes.
+    what : "height_m", "distance_m", "platform_m", "side_m" or "yaw_rad".
+    given : the rest of the target; by default a jump on the spot (a platform as near as it can be),
+        with whatever rise is best.
+    share : of the record, of the plan that is played first; a smaller one follows where a robot
+        falls.
+    engines : in which it is played; none with ().
+    changes : own ``limits``, ``mesh``, ``weights`` and so on, as of :class:`jumplab.Planner`.
+
+    Raises
+    ------
+    InputError
+        For another ``what``, or a share that is not between 0 and 1.
+    InfeasibleError
+        If no easy jump has a plan, or if the record is an end of what a target may ask for.
+    """
+    robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+    if what not in EASY:
+        raise InputError(f"what = {quoted(what)}: a record is one of {', '.join(EASY)}")
+    if not 0 < share <= 1:
+        raise InputError(f"share = {share:g} must be above 0 and at most 1")
+    for engine in engines:
+        if engine not in ENGINES:
+            raise InputError(f"engine {quoted(engine)}: choose of {', '.join(ENGINES)}, or none")
+    planner = Planner(robot, keep=True, **changes)
+    with unexplained():
+        search = _Search(planner, what, given)
+        found, best = search.from_easy()
+        plan, solved, program = search.plan_at(best)
+        share, reserve, runs = search.played(plan, share, engines)
+    ends = tuple(_binding(program, plan.task, solved))
+    value = getattr(plan.task, what)
+    report = _audited(plan)
+    return Record(what, value, plan, report, found, ends, share, reserve, runs, program, solved)
+
+
+class _Search:
+    """The search for one record."""
+
+    def __init__(self, planner: Planner, what: str, given: JumpTask | None):
+        self.planner = planner
+        self.stage = planner.stage("direct")
+        self.what = what
+        self.given = given or _usual(self.stage.body, what)
+        names = [name for name, field in SOUGHT.items() if field == what]
+        if given is None and what != "height_m":
+            names.append("takeoff_speed")
+        self.sought = tuple(names)
+
+    def program(self, task: JumpTask) -> Program:
+        """The one in which the number is an unknown, on a mesh of which little is left to gain."""
+        return self.stage.seeking(self.stage.program(task), self.sought).finer
+
+    def starts(self, best: list[tuple]) -> Iterator[JumpTask]:
+        """Jumps to begin with: easy ones, then shares of the ``best`` that was found."""
+        leg = self.stage.body.leg_m
+        for number, rise in EASY[self.what]:
+            x = number if self.what == "yaw_rad" else number * leg
+            more = {"height_m": rise * leg} if "takeoff_speed" in self.sought else {}
+            yield replace(self.given, **(more | {self.what: x}))
+        for share in CLIMB if best else ():
+            yield self.at(max(best, key=lambda x: x[0])[1], share)
+
+    def from_easy(self) -> tuple[dict[str, float], Solved]:
+        """What came of each start, and the best one."""
+        found: dict[str, float] = {}
+        best: list[tuple] = []
+        refusal = None
+        for task in self.starts(best):
+            size = f"{getattr(task, self.what):.3f} {unit_of(self.what)}"
+            word = f"{size}, rise {task.height_m:.3f} m"
+            tell(f"record of {self.planner.robot.name} from {word}")
+            found[word] = math.nan
+            try:
+                near = self.stage.solved(task)
+                program = self.program(task)
+                solved = program.solve(Asked(task, near=near), SEEKING)
+            except (InfeasibleError, SolverError) as e:
+                refusal = e
+                continue
+            reached = program.found(task, solved)
+            self.refuse_end(reached, solved)
+            found[word] = getattr(reached, self.what)
+            best.append((found[word], reached, solved))
+        if not best:
+            raise InfeasibleError(
+                f"robot {self.planner.robot.name}: no record of {self.what}, since none of "
+                f"{len(found)} easy jumps led to one; the last one: {refusal}"
+            ) from refusal
+        _, task, solved = max(best, key=lambda x: x[0])
+        self.task = task
+        return found, solved
+
+    def refuse_end(self, task: JumpTask, solved: Solved) -> None:
+        """Refuse a record that a number of the problem ends, not the robot."""
+        least, longest = self.stage.limits.flight_s
+        who = f"robot {self.planner.robot.name}: the record of {self.what} is ended by"
+        if solved.solution.phases["flight"].duration > (1 - NEAR_END) * longest:
+            raise InfeasibleError(
+                f"{who} the flight of {longest:g} s, the longest that plans may have, not by the "
+                f"robot; allow more by limits={{'flight_s': ({least:g}, {2 * longest:g})}}",
+                number="flight_s",
+                bound=longest,
+            )
+        for name in {SOUGHT[x] for x in self.sought}:
+            _, low, high = RANGES[name]
+            if getattr(task, name) > high - NEAR_END * (high - low):
+                raise InfeasibleError(
+                    f"{who} {name} = {high:g} {unit_of(name)}, the largest that a target may have, "
+                    f"not by the robot; give it lower limits, or hold more of the target",
+                    number=name,
+                    bound=high,
+                )
+
+    def plan_at(self, best: Solved) -> tuple[JumpPlan, Solved, Program]:
+        """The largest clean plan: the record on a mesh that is fine enough, else a little less;
+        with the record in the program's words.
+        """
+        robot = self.planner.robot
+        program = self.program(self.task)
+        failed = ""
+        for share in STEPS_BACK:
+            task = self.at(self.task, share)
+            try:
+                if share == 1:
+                    body = self.stage.refined(program, Asked(task, near=best), RECORD)
+                else:
+                    body = self.stage.plan(task, near=best)
+            except (InfeasibleError, SolverError) as e:
+                failed = str(e)
+                continue
+            plan = JumpPlan.of(robot, "direct", body)
+            if (report := _audited(plan)).passed:
+                break
+            failed = ", ".join(check.name for check in report.failed)
+        else:
+            raise SolverError(
+                f"robot {robot.name}: {self.what} reaches {getattr(self.task, self.what):.3f} at "
+                f"the nodes, but no plan down to {share:.0%} of it is clean ({failed})"
+            )
+        if share == 1:
+            contacts = body.schedule.contacts
+            finest = (
+                program if contacts == program.contacts else replace(program, contacts=contacts)
+            )
+            try:
+                return plan, finest.solve(Asked(body.task, near=body), RECORD), finest
+            except SolverError:
+                pass
+        return plan, best, program
+
+    def at(self, task: JumpTask, share: float) -> JumpTask:
+        """A ``share`` of what is sought; of a jump onto a platform the rise stays."""
+        return replace(task, **{self.what: share * getattr(task, self.what)})
+
+    def played(
+        self, plan: JumpPlan, share: float, engines: Sequence[str]
+    ) -> tuple[float, JumpPlan | None, dict[str, SimulationResult]]:
+        """A plan at a ``share`` of the record, played in all ``engines``: of several shares, each
+        :data:`LESS` than the one before, the first that lands in all, else the last one.
+        """
+        reserve = None
+        runs: dict[str, SimulationResult] = {}
+        for less in range(TRIED if len(engines) else 0):
+            tried = share - LESS * less
+            tell(f"playing {tried:.0%} of the record")
+            near = reserve or plan
+            with suppress(InfeasibleError, SolverError):
+                reserve = self.planner.plan(self.at(plan.task, tried), "direct", near=near)
+                scene = Scene.of_plan(reserve.summary, reserve.robot)
+                given = reserve.tape, reserve.robot
+                runs = {x: simulate_jump(*given, scene=scene, engine=x) for x in engines}
+                share = tried
+                if all(run.landed for run in runs.values()):
+                    break
+        return share, reserve, runs
+
+
+def unit_of(name: str) -> str:
+    """Unit of a number of the target, "m" or "rad"."""
+    return name.rpartition("_")[2].replace("height", "m")
+
+
+def _usual(body: Body, what: str) -> JumpTask:
+    """The rest of a target where nothing is said: on the spot, a platform as near as it can be."""
+    near = 0.0
+    if what == "platform_m":
+        near = 2 * body.half_m + Limits().edge_before_heel_m + PLATFORM_ROOM_M
+    return JumpTask(near, 0.2)
+
+
+def _audited(plan: JumpPlan) -> AuditReport:
+    return audit(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
+
+
+# what ends it
+# ----------------------------------------------------------------------------------------------
+def _binding(program: Program, task: JumpTask, solved: Solved) -> list[Binding]:
+    """The limits that end a record, the dearest first."""
+    phases = {p.name: p for p in solved.solution.problem.phases}
+    ends = np.cumsum([x.duration for x in solved.solution.phases.values()]).tolist()
+    began = dict(zip(phases, [0.0, *ends], strict=False))
+    found: dict[tuple, list] = {}
+    for (owner, term), column, share, lam, limit in program.limits_of(Asked(task), solved):
+        worth = lam * np.where(np.isfinite(limit), np.abs(limit), 0.0) / WORTH
+        for way in (1, -1):
+            key = owner in phases and _limit(phases[owner], program, term, column, way)
+            if key and (way * worth > 0).any():
+                found.setdefault((owner, *key), []).append((share, np.maximum(way * worth, 0.0)))
+    rows = []
+    for (owner, limit, joint), parts in found.items():
+        share = parts[0][0]
+        worth = sum(x for _, x in parts)
+        times = share[worth > BINDING_SHARE * worth.max()] * solved.solution.phases[owner].duration
+        first, last = (float(began[owner] + t) for t in (times.min(), times.max()))
+        if worth.sum() > BINDS:
+            rows.append(Binding(owner, limit, joint, first, last, float(worth.sum())))
+    return sorted(rows, key=lambda row: -row.worth)
+
+
+def _limit(
+    phase: Phase, program: Program, term: str, column: int, way: int
+) -> tuple[str, str] | None:
+    """A limit in words and its joint, upper or lower (``way`` 1, -1); None for those of numbers
+    that nobody has set.
+    """
+    if term == "bounds of constants":
+        return (f"duration of {phase.name}", "") if column == 0 else None
+    if term == TORQUE_SPEED:
+        return term, program.body.joint_names[program.free.joints[column]]
+    if term != "bounds of nodes":
+        return term, ""
+    count = len(phase.coordinates)
+    if column < 3 * count:
+        kind = ("upper stop" if way > 0 else "lower stop", "speed", None)[column // count]
+        return kind and (kind, phase.coordinates[column % count])
+    name = phase.states[column - 3 * count]
+    _, of, joint = name.partition("torque of ")
+    return ("torque", joint) if of else None
+
+
+# prices
+# ----------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class _Move:
+    """A limit that is moved: who then jumps, within what, by how many units."""
+
+    limit: str
+    unit: str
+    moved: float
+    robot: Robot
+    limits: Limits
+
+
+def _moves(record: Record, most: int) -> Iterator[_Move]:
+    """The limits that bind, and what each record depends on: friction, mass, legs."""
+    robot = record.program.robot
+    limits = record.program.limits
+    motors = robot.actuators
+    kinds = {"torque": ("torque",), "speed": ("speed",), TORQUE_SPEED: ("torque", "speed")}
+    pairs = {}
+    for row in record.limits:
+        for kind in kinds.get(row.limit, (row.limit,)):
+            if row.joint in motors:
+                pairs.setdefault((kind, row.joint))
+    for kind, joint in list(pairs)[:most]:
+        signs = _both(record.program, joint)
+        word = f"{_role(robot, joint)} {kind}"
+        if kind in STOPS:
+            way = STOPS[kind]
+            ranges = {
+                name: {END[way * sign]: motors[name][END[way * sign]] + way * sign * RANGE_RAD}
+                for name, sign in signs.items()
+            }
+            wider = robot.with_limits(joints=ranges)
+            yield _Move(word, "deg", math.degrees(RANGE_RAD), wider, limits)
+        else:
+            what, unit = MOTOR[kind]
+            stronger = robot.with_limits(**{what: dict.fromkeys(signs, 1 + MOVED)})
+            yield _Move(word, unit, MOVED * motors[joint][what], stronger, limits)
+    more = replace(limits, friction=limits.friction + FRICTION_STEP)
+    yield _Move("friction", "0.01", FRICTION_STEP / 0.01, robot, more)
+    heavier = robot.with_mass(factor=1 + MOVED)
+    yield _Move("mass, everywhere", "kg", MOVED * robot.total_mass, heavier, limits)
+    with suppress(RobotError):  # legs that nobody can stretch
+        longer = robot.with_legs(1 + MOVED)
+        leg_m = record.program.body.leg_m
+        yield _Move("thighs and shanks", "cm", 100 * MOVED * leg_m, longer, limits)
+
+
+def _both(program: Program, joint: str) -> dict[str, int]:
+    """A joint and the one on the other side, which an even motion moves alike, with its sign."""
+    names = program.body.model.names
+    column = program.free.spread[:, program.free.free_names.index(joint)]
+    return {names[k]: int(np.sign(column[k])) for k in np.flatnonzero(column)}
+
+
+def _role(robot: Robot, joint: str) -> str:
+    roles = {name: role for role, pair in robot.joints.items() for name in pair}
+    word = roles.get(joint, joint).removeprefix("left_").removeprefix("right_")
+    return word.replace("_", " ")
+
+
+def _priced(record: Record, most: int) -> Prices:
+    """The prices of a record.
+
+    Multipliers say what a limit is worth in the sum of record and effort; how that grows with the
+    worth of the record alone is what it buys. So two records of different worth make a price, with
+    the effort's part gone.
+    """
+    program = record.program
+    task = record.plan.task
+    usual = next(
+        t.weight for _, t in record.solved.solution.problem.terms() if t.name == RECORD_TERM
+    )
+    first = Asked(task), record.solved
+    other = Asked(task, weights={RECORD_TERM: MORE * usual})
+    second = other, program.solve(other, RECORD, from_solved(program, record.solved))
+    reached = _reached(program, record.solved)
+    # of the cost by what is sought, which is nearly a straight line; a rise goes with the square
+    slope = -(MORE - 1) * WORTH * (1 - reached / FAR)
+    by = reached / task.gravity if program.sought[0] == "takeoff_speed" else 1.0
+    costs = [program.cost_of(*x) for x in (first, second)]
+    active = _active(program, task, record.solved)
+    rows = []
+    for move in _moves(record, most):
+        tell(f"price of {move.limit}")
+        body = Body(move.robot)
+        free = KINDS[program.free.kind](body)
+        moved = replace(program, body=body, limits=move.limits, free=free, keep=False)
+        saved = [moved.cost_of(*x) - cost for x, cost in zip((first, second), costs, strict=True)]
+        price = by * (saved[1] - saved[0]) / slope / move.moved
+        checked = math.nan
+        stays = False
+        with suppress(SolverError):
+            solved = moved.solve(first[0], RECORD, from_solved(moved, record.solved))
+            checked = by * (_reached(moved, solved) - reached) / move.moved
+            stays = _active(moved, task, solved) == active
+        rows.append(Price(move.limit, move.unit, price, checked, move.moved, stays))
+    rows.sort(key=lambda row: -abs(row.price * row.moved))
+    return Prices(record.what, record.plan.robot.name, record.unit, tuple(rows))
+
+
+def _active(program: Program, task: JumpTask, solved: Solved) -> set[tuple]:
+    """The limits that bind, node by node."""
+    return {
+        (name, column, int(k))
+        for name, column, _, lam, limit in program.limits_of(Asked(task), solved)
+        for k in np.flatnonzero(np.abs(lam) * np.minimum(np.abs(limit), 1.0) > ACTIVE * WORTH)
+    }
+
+
+def _reached(program: Program, solved: Solved) -> float:
+    """What is sought, in the words of the program."""
+    return next(iter(solved.solution.phases.values())).constants[program.sought[0]]

@@ -1,0 +1,110 @@
+"""Records of the robots by name: the rows of ``records.jsonl``.
+
+``python -m paper.records`` in the folder of the notebooks seeks what :data:`LOG` lacks, a line a record, and can be
+stopped and started again; ``python -m paper.records table`` prints the file. A record is "at least": a local solver
+speaks.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from jumplab.errors import JumplabError
+from jumplab.io.files import open_log
+from jumplab.robot import Robot
+from jumplab.robot.files import SHIPPED
+from jumplab.show.tables import Table, table
+from jumplab.studies.record import record
+
+LOG = Path(__file__).with_name("records.jsonl")
+WHAT = ("height_m", "distance_m")
+BINDING = 3  # limits that a row names
+COLUMNS = {
+    "robot": "robot",
+    "highest": "rise in flight [m]",
+    "standing": "apex against standing [m]",
+    "played_high": "lands at",
+    "farthest": "distance [m]",
+    "played_far": "lands at ",
+    "ends": "the rise ends by",
+}
+
+
+def row(name: str, what: str) -> dict[str, Any]:
+    """The record of a robot in plain data; ``reason`` where there is none."""
+    began = time.process_time()
+    found: dict[str, Any] = {"robot": name, "what": what, "value": None}
+    try:
+        robot = Robot.load(name)
+        found["planar"] = robot.planar
+        best = record(robot, what)
+        ends = dict.fromkeys(f"{x.joint.replace('_', ' ')} {x.limit}".strip() for x in best.limits)
+        found |= {
+            "value": round(best.value, 4),
+            "rise_m": round(best.plan.planned_rise_m, 4),
+            "apex_m": round(best.plan.planned_apex_m, 4),
+            "starts": {word: x if x == x else None for word, x in best.found.items()},
+            "alike": best.alike,
+            "clean": best.audit.passed,
+            "ends": list(ends)[:BINDING],
+            "share": round(best.share, 3),
+            "landed": {engine: run.landed for engine, run in best.runs.items()},
+        }
+    except JumplabError as e:
+        found["reason"] = str(e)
+    return found | {"cpu_s": round(time.process_time() - began, 1)}
+
+
+def rows() -> list[dict[str, Any]]:
+    """The records on file."""
+    return [json.loads(line)["row"] for line in LOG.read_text(encoding="utf-8").splitlines()]
+
+
+def missing(done: Any) -> Iterator[tuple[str, str]]:
+    """Records that the log lacks, first those of robots that are planned in the plane."""
+    planar = {}
+    for name in SHIPPED:
+        with suppress(JumplabError):  # its description is not installed
+            planar[name] = Robot.load(name).planar
+    cases = [(name, what) for what in WHAT for name in planar]
+    for name, what in sorted(cases, key=lambda case: not planar[case[0]]):
+        if f"{name} {what}" not in done:
+            yield name, what
+
+
+def records_table() -> Table:
+    """The records of each robot, a row a robot."""
+    by: dict[str, dict[str, dict[str, Any]]] = {}
+    for x in rows():
+        by.setdefault(x["robot"], {})[x["what"]] = x
+    out = []
+    for name, found in by.items():
+        high, far = (found.get(what, {}) for what in WHAT)
+        line = {"robot": name, "ends": ", ".join(high.get("ends", ()))}
+        line |= {"highest": high.get("value"), "standing": high.get("apex_m"), "farthest": far.get("value")}
+        for key, x in (("played_high", high), ("played_far", far)):
+            line[key] = f"{x['share']:.0%}" if x.get("landed") and all(x["landed"].values()) else None
+        out.append(line)
+    return table(out, COLUMNS, digits=3)
+
+
+def main() -> None:
+    """Seek what is missing, or print the table."""
+    if sys.argv[1:] == ["table"]:
+        print(records_table())
+        return
+    with open_log(LOG, "records", lambda line: (line["key"], line["row"])) as log:
+        for name, what in missing(log.done):
+            found = row(name, what)
+            log.add({"key": f"{name} {what}", "row": found})
+            print(found, flush=True)
+
+
+if __name__ == "__main__":
+    main()

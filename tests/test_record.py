@@ -1,0 +1,131 @@
+"""Records: a number of the target as large as can be, what ends it, and what more of a limit buys."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import jumplab as jl
+from jumplab.cli.main import main
+from jumplab.errors import InfeasibleError, InputError
+from jumplab.ocp import Bound, Nlp, Phase, PhaseGuess, Problem, Term
+from jumplab.ocp.nlp import patience
+from jumplab.show import price_bars
+from jumplab.studies import record as study
+
+pytestmark = pytest.mark.slow  # the record takes ten seconds, its prices as long
+
+
+@pytest.fixture(scope="module")
+def highest():
+    """The highest jump of the default robot."""
+    return jl.record("bhr", "height_m", engines=())
+
+
+@pytest.fixture(scope="module")
+def prices(highest):
+    return highest.prices(most=4)
+
+
+def test_a_constant_with_the_name_of_a_parameter_takes_its_place():
+    """A run of one second from rest to rest, as far as a rate of 1 m/s and 8 m/s^2 allow."""
+    far = Term("far", "ours", "m", "end", lambda p: 10.0 - p.p.goal, 1.0)
+    there = Term("goal", "ours", "m", "end", lambda p: p.q - p.p.goal)
+    ends = (("q", "start"), ("v", "start"), ("v", "end"))
+    stops = [Bound(f"{on} {at}", "ours", "m", on, 0, 0, at) for on, at in ends]
+    limits = (Bound("rate", "ours", "m/s", "v", -1, 1), Bound("push", "ours", "m/s^2", "a", -8, 8))
+    known = {"goal": (0.0, 5.0, 1.0)}
+    phase = Phase("go", ("x",), 40, (1.0, 1.0), (far, there), (*stops, *limits), constants=known)
+    nlp = Nlp(Problem("run", (phase,), parameters={"goal": 1}))
+    found = nlp.solve({"goal": 0.1}, {"go": PhaseGuess(1.0, np.zeros((41, 1)))}).phases["go"]
+    # from 0 to 1 m/s by straight lines of the acceleration takes at least 1/8 s and one interval
+    assert 0.8 < found.constants["goal"] < 0.875
+    assert found.q[-1, 0] == pytest.approx(found.constants["goal"], abs=1e-6)
+
+
+def test_a_record_is_a_clean_plan_and_no_easier_start_beats_it(highest):
+    assert highest.audit.passed and highest.plan.task.height_m == highest.value
+    assert highest.plan.planned_rise_m == pytest.approx(highest.value, abs=5e-3)
+    assert 0.94 < highest.value < 1.0 and len(highest.found) == 6 and highest.alike >= 3
+    assert "at least" in highest.line() and f"{highest.value:.3f} m" in highest.line()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        highest.value = 2.0
+
+
+def test_what_ends_a_record_is_named_with_joint_phase_and_time(highest):
+    first = highest.limits[0]
+    assert (first.limit, first.joint) == ("upper stop", "left_knee")
+    assert {"torque-speed", "torque"} <= {x.limit for x in highest.limits if x.phase == "toe"}
+    worths = [x.worth for x in highest.limits]
+    assert worths == sorted(worths, reverse=True) and worths[-1] > 0
+    end = float(highest.plan.tape.t[-1])
+    assert all(0 <= x.from_s <= x.to_s <= end + 1e-6 for x in highest.limits)
+
+
+def test_prices_are_those_of_records_with_the_limit_moved(prices):
+    rows = {row.limit: row for row in prices.rows}
+    assert {"knee speed", "knee torque", "knee upper stop", "friction"} <= set(rows)
+    assert rows["knee torque"].price > 0 > rows["mass, everywhere"].price
+    assert rows["thighs and shanks"].price > 0 and rows["knee speed"].unit == "rad/s"
+    kept = [row for row in prices.rows if row.stays]
+    assert len(kept) >= 4
+    for row in kept:
+        assert row.gap <= 0.05, row
+
+
+def test_records_and_prices_have_cards_and_bars(highest, prices):
+    assert "upper stop" in highest._repr_html_() and "Record" in highest._repr_html_()
+    assert "knee speed" in prices._repr_html_()
+    bars = price_bars(prices)
+    names = [label.get_text() for label in bars.axes[0].get_yticklabels()]
+    assert len(names) == min(14, len(prices.rows)) and any("1 % (" in name for name in names)
+
+
+def test_a_robot_without_an_easy_jump_has_no_record(bhr):
+    none = r"no record of height_m, since none of 3 easy jumps"
+    with patience(1.0), pytest.raises(InfeasibleError, match=none):
+        jl.record(bhr.with_limits(effort=0.1), "height_m", engines=())
+
+
+def test_a_record_that_only_a_number_of_the_problem_ends_is_refused_in_a_sentence(bhr):
+    with pytest.raises(InfeasibleError, match=r"distance_m = 3 m, the largest that a target may have") as e:
+        jl.record(bhr, "distance_m", engines=())
+    assert (e.value.number, e.value.bound) == ("distance_m", 3.0)
+    on_the_moon = jl.JumpTask(0.0, 0.2, gravity=1.62)
+    with pytest.raises(InfeasibleError, match=r"the flight of 1.5 s, the longest .* \(0.05, 3\)"):
+        jl.record(bhr, "height_m", on_the_moon, engines=())
+
+
+@pytest.mark.parametrize(
+    ("what", "options", "sentence"),
+    [
+        ("gravity", {}, "a record is one of height_m, distance_m"),
+        ("height_m", {"share": 0.0}, "share = 0 must be above 0"),
+        ("height_m", {"given": 3}, "given"),
+        ("height_m", {"engines": ("ode",)}, "ode"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_anything_is_solved(what, options, sentence, monkeypatch):
+    monkeypatch.setattr(study, "_Search", None)
+    with pytest.raises(InputError, match=sentence):
+        jl.record("bhr", what, **options)
+
+
+def test_the_command_prints_the_record_and_its_prices(highest, prices, monkeypatch, capsys, tmp_path):
+    asked = {}
+
+    def known(robot, what, given, share):
+        asked.update(robot=robot, what=what, given=given, share=share)
+        return highest
+
+    monkeypatch.setattr(study, "_priced", lambda *_: prices)
+    monkeypatch.setattr(study, "record", known)
+    out = tmp_path / "high"
+    assert main(["record", "bhr", "height_m", "--distance-m", "0.1", "--prices", "--out", str(out)]) == 0
+    assert asked["given"] == jl.JumpTask(0.1, 0.2) and asked["share"] == 0.95 and asked["what"] == "height_m"
+    text = capsys.readouterr().out
+    assert "height at least" in text and "knee speed" in text and (out / "plan.npz").is_file()
+    assert main(["record", "bhr", "height_m", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["record"]
+    assert found["value"] == highest.value and found["limits"][0]["limit"] == "upper stop"
