@@ -101,14 +101,15 @@ def check(folder):
     return summary["target"]["height_m"], bool(found)
 
 
+def starting(said):
+    """Whether it was shot while Python was still starting: the command's own ``main`` is not in the traceback."""
+    return "KeyboardInterrupt" in said and not re.search(r'jumplab/__main__\.py", line \d+, in main\n', said)
+
+
 def quiet(said, code, kind):
     """Once the command has begun it leaves one sentence at most, and its exit code; before, Python itself speaks."""
-    if (
-        kind == signal.SIGINT
-        and "KeyboardInterrupt" in said
-        and not re.search(r'jumplab/__main__\.py", line \d+, in main\n', said)
-    ):
-        return  # shot while Python was still starting
+    if kind == signal.SIGINT and starting(said):
+        return
     assert "Traceback" not in said and said.count("\n") <= 1, said
     answered = {signal.SIGKILL: {-9}, signal.SIGTERM: {143, -15}, signal.SIGINT: {130, -2}}[kind]
     assert code in {0, *answered}
