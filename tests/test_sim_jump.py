@@ -347,7 +347,7 @@ def test_an_exploded_engine_is_an_error(bhr, tape):
     ("options", "words"),
     [
         ({"mode": "velocity"}, "mode 'velocity': must be one of position, pd, whole-body"),
-        ({"mode": None}, "mode None: must be one of position, pd, whole-body"),
+        ({"mode": None}, "mode must be a text, got None"),
         ({"contact": "soft"}, "contact 'soft': must be one of hard, usual"),
         ({"contact": None}, "contact None: must be one of hard, usual"),
         ({"landing": "soft"}, "landing 'soft': must be one of planned, spring"),

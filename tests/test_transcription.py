@@ -271,7 +271,7 @@ def test_names_are_checked():
     with pytest.raises(InputError) as e:
         problem.check_names(["mid rwo"], "switch")
     assert str(e.value).startswith(
-        "switch 'mid rwo': the problem 'toy' has no such term; it has drift, end row, jerk, "
+        "switch 'mid rwo': the problem 'toy' has no such term; it has mid row, "
     )
 
 

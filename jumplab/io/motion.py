@@ -163,7 +163,11 @@ def read_simulation(
         ) from e
     nv = robot.model.nv
     widths = dict(t=(), q=(robot.model.nq,), v=(nv,), tau=(nv - 6,), phase=(), foot_wrench=(2, 6))
-    fits = all(data[k].shape == (data["t"].size, *widths[k]) for k in widths.keys() & data)
+    fits = all(
+        data[k].shape == (data["t"].size, *widths[k])
+        and (k == "phase" or data[k].dtype.kind == "f")
+        for k in widths.keys() & data
+    )
     if schema != SIMULATION_SCHEMA or joints != robot.joint_names or not fits:
         raise InputError(
             f"{path}: not a simulation of this folder's robot; simulate the plan again"
