@@ -177,7 +177,7 @@ def test_either_a_target_or_a_schedule():
         with pytest.raises(InputError) as e:
             jl.plan(**asked)
         assert str(e.value) == said
-    with pytest.raises(InputError, match=r"^a contact schedule, or a jump like a clip, is planned by the whole-body program; leave method"):
+    with pytest.raises(InputError, match=r"^a contact schedule, or a jump like a clip, is planned by "):
         jl.plan(contacts=jl.Contacts.hop(jl.Robot.load()), method="direct")
 
 
