@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.io import folder as folders
+from jumplab.ocp.nlp import patience
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
@@ -84,14 +85,8 @@ def plan(
                 "a contact schedule, or a jump like a clip, is planned by the whole-body program; "
                 "leave method and robust out, and give one of both"
             )
-    if like is not None:
-        from jumplab.studies.mend import like as alike
-
-        return alike(task, like, robot, **changes)
-    if contacts is not None:
-        if isinstance(contacts, str):
-            contacts = Contacts.named(contacts, robot)
-        return Planner(robot, keep=True, **changes).follow(contacts)
+        with patience(patience_s):
+            return _followed(task, robot, contacts, like, changes)
     if robust is not None:
         from jumplab.studies.robust import robust_changes
 
@@ -99,14 +94,31 @@ def plan(
     return plan_or_advise(Planner(robot, keep=True, **changes), task, method, patience_s)
 
 
+def _followed(
+    task: JumpTask | None,
+    robot: Robot,
+    contacts: Contacts | str | None,
+    like: Any,
+    changes: dict[str, Any],
+) -> JumpPlan:
+    """Along a contact schedule, or that of a clip."""
+    if like is not None:
+        from jumplab.studies.mend import like as alike
+
+        return alike(task, like, robot, **changes)
+    if isinstance(contacts, str):
+        contacts = Contacts.named(contacts, robot)
+    return Planner(robot, keep=True, **changes).follow(contacts)
+
+
 @checked
 def audit(plan: JumpPlan) -> AuditReport:
     """Check a plan by a second code path that sees its tape, its robot and its target, and nothing
     of the planner.
     """
-    from jumplab.auditing import audit as check
+    from jumplab.auditing import audit_plan
 
-    return check(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
+    return audit_plan(plan)
 
 
 @checked

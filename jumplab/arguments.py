@@ -48,8 +48,8 @@ def real(value: Any, what: str, unit: str = "") -> float:
 
 
 def shaped(value: Any, shape: tuple[int | None, ...], what: str) -> np.ndarray:
-    """An array of this ``shape``, None for any length; raises :class:`InputError`, which calls it
-    ``what``.
+    """An array of this ``shape``, such as (None, 3) for any number of rows; raises
+    :class:`InputError`, which calls it ``what``.
     """
     array = _array(value, what)
     fits = array.ndim == len(shape) and all(

@@ -88,8 +88,8 @@ def quoted(value: Any) -> str:
 
 
 def nearest(names: Iterable[str], to: Any) -> str:
-    """The names that there are, of many those nearest to what was asked for, as a message may list
-    them.
+    """The names that there are, of many those nearest ``to`` what was asked for, as a message may
+    list them ("knee, hip and 3 more").
     """
     names = sorted(names)
     if len(names) <= LISTED:

@@ -8,6 +8,7 @@ from fixtures_core import planner
 from paper.goal_bias import reach_goal
 
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.robot import Robot
 from jumplab.sim import Perturbation, Scene
 from jumplab.task import JumpTask
 
@@ -22,7 +23,7 @@ class Straight:
     offset: tuple[float, float] = (0.0, 0.0)
     lands: bool = True
     longest_m: float = 3.0
-    robot: object = None
+    robot: Robot = field(default_factory=Robot.load)
     scenes: list = field(default_factory=list)
 
     def plan(self, task, method):

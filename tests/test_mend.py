@@ -134,8 +134,8 @@ def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
     assert {c.name for c in jl.judge(mended.plan).failed} <= {"joint torque", "torque at speed"}
     assert rows["joints, rms [rad]"]["change"] < 0.25 and rows["footholds, largest [m]"]["change"] < 0.07
     assert abs(rows["flight 1 [s]"]["change"]) < 0.15 * rows["flight 1 [s]"]["clip"]
-    assert mended.binding and mended.factor == 1 and mended.jump.tape.t[-1] < mended.plan.tape.t[-1]
-    assert jl.simulate(mended.jump).landed
+    assert mended.binding and mended.factor == 1
+    assert jl.simulate(mended.plan).landed
     folder = export.write("mujoco", Motion.of(mended.plan.tape), mended.plan.robot, tmp_path / "mujoco")
     off_m, height_m = played(folder)
     assert off_m < 0.1 and height_m > 0.7  # the plain player below stands a second after the end

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from jumplab.arguments import real
 from jumplab.auditing import contact, dynamics, motion
@@ -34,6 +35,12 @@ GROUPS = (
     contact.collisions,
     dynamics.description,
 )
+
+
+def audit_plan(plan: Any) -> AuditReport:
+    """:func:`audit` of a plan, a :class:`jumplab.JumpPlan`, with all that it was asked for."""
+    edge_m = plan.summary["platform_edge_m"]
+    return audit(plan.tape, plan.robot, plan.task, edge_m=edge_m)
 
 
 def audit(

@@ -15,7 +15,6 @@ auditing = Late("auditing")
 
 REPORT = "judged.json"
 CHANGES = "mended.json"
-JUMP = "jump"
 
 
 def judge(args: Namespace) -> None:
@@ -72,10 +71,5 @@ def mend(args: Namespace) -> None:
     print_summary(plan.summary)
     print(mended.line())
     print(tables.table(mended.changes, ["what", "clip", "mended", "change"], digits=3))
-    if mended.jump is not None:
-        folder = Path(args.out, JUMP)
-        jump = mended.jump
-        store.write_plan(folder, jump.tape, jump.robot, jump.summary, complete=auditing.write_audit)
-        print(f"up to touchdown, to be simulated: {folder}")
     print(f"shaped most by: {', '.join(mended.binding) or 'no limit'}")
     audited(report, args.out)

@@ -204,7 +204,7 @@ def retargeted(whole: Whole, x: Motion, fps: float) -> dict[str, object]:
 
 def with_base(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
     """What trainers in Isaac Lab keep of a motion: joints breadth-first, by name, and the base,
-    quaternion w x y z, velocities in world axes at its origin; 32-bit floats.
+    (F, 3) and quaternion (F, 4) w x y z, velocities in world axes at its origin; 32-bit floats.
     """
     base, turn, speed, spin = whole.bodies(x, whole.links[:1], at_com=False).values()
     arrays = tracked(whole, x, fps, order=ORDERS[1])

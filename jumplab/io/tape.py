@@ -90,7 +90,7 @@ class Tape(Shown):
         return int(came[-1]) if len(came) and down[-1].any() else len(self.t)
 
     def until(self, row: int) -> Tape:
-        """The tape up to a ``row``, which it does not have any more."""
+        """The tape up to a ``row`` (of N), which it does not have any more."""
         rows = self.arrays().items()
         cut = {k: x[:row] for k, x in rows if np.shape(x)[:1] == self.t.shape}
         own = {k: x for k, x in cut.items() if k in _DIMENSIONS}

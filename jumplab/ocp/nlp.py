@@ -16,7 +16,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from jumplab.errors import SolverError
+from jumplab.errors import InputError, SolverError
 from jumplab.io.progress import tell
 from jumplab.ocp.assembly import Assembled, ipopt
 from jumplab.ocp.cache import in_turn
@@ -70,7 +70,12 @@ def unexplained() -> Iterator[None]:
 
 @contextmanager
 def patience(seconds: float) -> Iterator[None]:
-    """Inside, a search ends after so much processor time [s], with the best that it has."""
+    """Inside, a search ends after so much processor time [s], with the best that it has.
+
+    Raises :class:`InputError` unless it is positive.
+    """
+    if not seconds > 0:
+        raise InputError(f"patience_s must be a positive number of seconds, got {seconds!r}")
     outside = DEADLINE.set(time.process_time() + seconds)
     try:
         yield

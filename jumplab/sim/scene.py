@@ -118,14 +118,15 @@ class Scene:
         at the edge.
         """
         try:
-            task = JumpTask(**summary["target"])
-            if task.platform_m == 0:
+            top = summary["target"]["platform_m"]
+            if top == 0:
                 return cls.flat()
+            along_rad = JumpTask(**summary["target"]).along_rad
             # soles' middle at x = 0
             edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])
         except (KeyError, TypeError) as e:
             raise InputError(f"the summary is none of a plan ({e})") from None
-        return cls.level("platform", {edge: task.platform_m}, task.along_rad)
+        return cls.level("platform", {edge: top}, along_rad)
 
     @classmethod
     def of_run(cls, report: Mapping[str, Any], summary: Mapping[str, Any], robot: Robot) -> Scene:

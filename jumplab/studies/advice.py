@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from jumplab.auditing import audit
+from jumplab.auditing import audit_plan
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import left_s, patience, unexplained
@@ -36,8 +36,6 @@ def plan_or_advise(
     Planning ends after ``patience_s`` of processor time [s]. Looking for another target takes some
     seconds more, so studies of many targets leave it out.
     """
-    if not patience_s > 0:
-        raise InputError(f"patience_s must be a positive number of seconds, got {patience_s!r}")
     with patience(patience_s):
         try:
             return planner.plan(task, method)
@@ -94,7 +92,7 @@ def _refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | No
         plan = planner.plan(task, method)
     except JumplabError as e:
         return e
-    report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
+    report = audit_plan(plan)
     return None if report.passed else SolverError("its plan fails its audit", stage="audit")
 
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -95,25 +94,6 @@ class Mended(Shown):
         kept = f"{self.before.clip.name}, {begin:.2f} to {end:.2f} s of {all_s:.2f} s"
         return f"{kept}, as {self.plan.line()}"
 
-    @cached_property
-    def jump(self) -> JumpPlan | None:
-        """The plan up to touchdown, which control can play and catch; None unless both feet leave
-        the ground together, and once.
-        """
-        tape = self.plan.tape
-        carrying = tape.extra["contacts"] > 0
-        flying = ~carrying.any(axis=1)
-        flights = spans(flying)
-        if len(flights) != 1 or flying[0] or not carrying[~flying].all():
-            return None
-        end = flights[0][1]
-        rows = ("t", "q", "v", "a", "tau", "phase", "f")
-        cut = {name: getattr(tape, name)[:end] for name in rows}
-        long = {k: x[:end] for k, x in tape.extra.items() if np.shape(x)[:1] == tape.t.shape}
-        tape = replace(tape, **cut, extra={**tape.extra, **long})
-        summary = {k: x for k, x in self.plan.summary.items() if k != "contacts"}
-        return JumpPlan.on_file(tape, self.plan.robot, summary)
-
     def to_json(self) -> dict[str, Any]:
         """Plain data of all but the plan."""
         return {
@@ -150,10 +130,7 @@ def mend(
         If no motion near it keeps the limits; says which forbid it, and the largest part of the
         clip (in way, turn and height) that can be done.
     """
-    before = (
-        motion if isinstance(motion, ClipReport) else judge(motion, robot, fps=fps, order=order)
-    )
-    require_type(before, ClipReport, "one clip to mend")
+    before = _judged(motion, robot, fps, order)
     planner = Planner(before.clip.robot, keep=True, **changes)
     try:
         return _mended(planner, before)
@@ -191,7 +168,7 @@ def like(
 
     Parameters
     ----------
-    task : travel, rise and turn on level ground.
+    task : travel and rise [m], and turn [rad], on level ground.
     motion, robot, fps, order, changes : as of :func:`mend`; the clip jumps once, off both feet and
         down on both.
 
@@ -202,10 +179,7 @@ def like(
     """
     if task.platform_m or task.rotation_rad:
         raise InputError("a jump like a clip is one on level ground that does not turn over")
-    before = (
-        motion if isinstance(motion, ClipReport) else judge(motion, robot, fps=fps, order=order)
-    )
-    require_type(before, ClipReport, "one clip to jump like")
+    before = _judged(motion, robot, fps, order)
     draft = Draft(before, goal=task)
     return Planner(before.clip.robot, keep=True, **changes).follow(
         draft.contacts,
@@ -215,6 +189,14 @@ def like(
         motion=draft.motion,
         stance=draft.start,
     )
+
+
+def _judged(motion: Any, robot: Robot | str, fps: float | None, order: str) -> ClipReport:
+    """The report of one clip, or that which is given."""
+    if not isinstance(motion, ClipReport):
+        motion = judge(motion, robot, fps=fps, order=order)
+    require_type(motion, ClipReport, "one clip")
+    return motion
 
 
 def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jumplab.arguments import checked
-from jumplab.auditing import AuditReport, audit
+from jumplab.auditing import AuditReport, audit_plan
 from jumplab.errors import InfeasibleError, InputError, RobotError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
@@ -174,26 +174,33 @@ class Record(Shown):
         return unit_of(self.what)
 
     @property
+    def best(self) -> float:
+        """The largest number at the nodes, of all starts [m, rad]."""
+        return max(x for x in self.found.values() if x == x)
+
+    @property
     def alike(self) -> int:
         """Starts that ended within 1 % of the best."""
-        best = max(x for x in self.found.values() if x == x)
-        return sum(x >= (1 - SAME) * best for x in self.found.values())
+        return sum(x >= (1 - SAME) * self.best for x in self.found.values())
 
     def line(self) -> str:
         """The record in a sentence."""
         word = self.what.rpartition("_")[0]
         ends = list(dict.fromkeys(f"{x.joint} {x.limit}".strip() for x in self.limits))[:3]
         landed = [name for name, run in self.runs.items() if run.landed]
+        stepped = ""
+        if self.value < (1 - SAME) * self.best:
+            stepped = f" (at {self.best:.3f}, from where a clean plan steps back; prices too)"
         played = f", lands at {self.share:.0%} of it in {' and '.join(landed) or 'no engine'}"
         return (
             f"{self.plan.robot.name}: {word} at least {self.value:.3f} {self.unit} "
             f"({self.alike} of {len(self.found)} starts within 1 %), ends by "
-            f"{', '.join(ends)}{played * bool(self.runs)}"
+            f"{', '.join(ends)}{stepped}{played * bool(self.runs)}"
         )
 
     def prices(self, most: int = MOST) -> Prices:
         """What more of the ``most`` dearest limits of joints would buy, and of friction, mass and
-        legs; each checked by a record with it moved, which takes a second or two.
+        legs [m or rad per unit]; each checked by a record with it moved (a second or two).
         """
         return _priced(self, most)
 
@@ -244,7 +251,7 @@ def record(
         share, reserve, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
-    report = _audited(plan)
+    report = audit_plan(plan)
     return Record(what, value, plan, report, found, ends, share, reserve, runs, program, solved)
 
 
@@ -266,7 +273,7 @@ class _Search:
         return self.stage.seeking(self.stage.program(task), self.sought).finer
 
     def starts(self, best: list[tuple]) -> Iterator[JumpTask]:
-        """Jumps to begin with: easy ones, then shares of the ``best`` that was found."""
+        """Jumps to begin with: easy ones (:data:`EASY`), then shares of the ``best`` one."""
         leg = self.stage.body.leg_m
         for number, rise in EASY[self.what]:
             x = number if self.what == "yaw_rad" else number * leg
@@ -344,7 +351,7 @@ class _Search:
                 failed = str(e)
                 continue
             plan = JumpPlan.of(robot, "direct", body)
-            if (report := _audited(plan)).passed:
+            if (report := audit_plan(plan)).passed:
                 break
             failed = ", ".join(check.name for check in report.failed)
         else:
@@ -364,14 +371,14 @@ class _Search:
         return plan, best, program
 
     def at(self, task: JumpTask, share: float) -> JumpTask:
-        """A ``share`` of what is sought; of a jump onto a platform the rise stays."""
+        """A ``share`` [1] of what is sought; of a jump onto a platform the rise stays."""
         return replace(task, **{self.what: share * getattr(task, self.what)})
 
     def played(
         self, plan: JumpPlan, share: float, engines: Sequence[str]
     ) -> tuple[float, JumpPlan | None, dict[str, SimulationResult]]:
-        """A plan at a ``share`` of the record, played in all ``engines``: of several shares, each
-        :data:`LESS` than the one before, the first that lands in all, else the last one.
+        """A plan at a ``share`` [1] of the record, played in all ``engines``: of several shares,
+        each :data:`LESS` than the one before, the first that lands in all, else the last one.
         """
         reserve = None
         runs: dict[str, SimulationResult] = {}
@@ -401,10 +408,6 @@ def _usual(body: Body, what: str) -> JumpTask:
     if what == "platform_m":
         near = 2 * body.half_m + Limits().edge_before_heel_m + PLATFORM_ROOM_M
     return JumpTask(near, 0.2)
-
-
-def _audited(plan: JumpPlan) -> AuditReport:
-    return audit(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
 
 
 # what ends it

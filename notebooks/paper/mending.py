@@ -57,9 +57,9 @@ def _measures(report: ClipReport) -> dict[str, float]:
 
 
 def _played(mended: Mended) -> dict[str, bool | None]:
-    """By engine, whether the simulated robot lands the jump; None where the schedule is no jump from two feet."""
-    jump = mended.jump
-    return {engine: None if jump is None else jl.simulate(jump, engine=engine).landed for engine in ENGINES}
+    """By engine, whether the simulated robot lands; None where the clip has no flight."""
+    plan = mended.plan
+    return {engine: jl.simulate(plan, engine=engine).landed if plan.tape.flights else None for engine in ENGINES}
 
 
 def failing(measures: Mapping[str, float]) -> list[str]:

@@ -16,7 +16,6 @@ import jumplab as jl
 from jumplab.errors import SolverError
 from jumplab.io.files import write_file
 from jumplab.io.tape import Tape
-from jumplab.ocp.nlp import patience
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, by_phase, new_figure
 from jumplab.stages.plan import JumpPlan, planned
@@ -89,8 +88,7 @@ def _row(folder: Path, robot: str, case: str) -> dict[str, Any]:
 def _planned(folder: Path, robot: str, words: str) -> JumpPlan:
     if (folder / "plan.npz").is_file():
         return jl.load(folder).plan
-    with patience(PATIENCE_S):
-        plan = jl.plan(robot=robot, contacts=words)
+    plan = jl.plan(robot=robot, contacts=words, patience_s=PATIENCE_S)
     jl.save(folder, plan)
     return plan
 

@@ -146,7 +146,6 @@ class WholeBodyPlanner:
         near: WholeBodyPlan | Mapping[str, PhaseGuess] | None = None,
         stance: np.ndarray | None = None,
         starts: Sequence[Start] | None = None,
-        sought: tuple[str, ...] = (),
     ) -> WholeBodyPlan:
         """Solve for a target, from one start after the other, up to the first motion that keeps
         every limit.
@@ -160,8 +159,6 @@ class WholeBodyPlanner:
         stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's
             places; it if None.
         starts : instead of the usual list.
-        sought : parameters of the target that are unknowns, the first of which is maximised; their
-            values in ``task`` are where they begin.
 
         Where nobody reads why there is no plan, :data:`jumplab.ocp.nlp.EXPLAINED` is off, and it
         gives up sooner.
@@ -177,7 +174,7 @@ class WholeBodyPlanner:
         chart = None if stance is None else self.body.model.of_pinocchio(stance[None])[0]
         self._check_standing(task, chart)
         asked = Asked(task, chart, srmp, weights, near, begin, self._straight)
-        programs = [self.seeking(x, sought) for x in self.programs(task, weights)]
+        programs = self.programs(task, weights)
         plans = []
         failures = []
         for program in programs:
@@ -209,8 +206,8 @@ class WholeBodyPlanner:
         )
 
     def solved(self, task: JumpTask) -> Solved:
-        """The first motion that keeps every limit at the nodes, without a look between them; raises
-        as :meth:`plan`.
+        """The first motion that keeps every limit at the nodes (N + 1,), without a look between
+        them; raises as :meth:`plan`.
         """
         self._check_standing(task, None)
         asked = Asked(task, straight=self._straight)
@@ -222,11 +219,13 @@ class WholeBodyPlanner:
         return program.solve(asked, last)
 
     def seeking(self, program: Program, sought: tuple[str, ...]) -> Program:
-        """The same ``program`` with parameters of the target as unknowns, built once."""
+        """The same ``program`` with parameters of the target (of :data:`.SOUGHT`) as unknowns, the
+        first one maximised; built once.
+        """
         key = program.free.kind, sought
-        if sought and key not in self._sought:
+        if key not in self._sought:
             self._sought[key] = replace(program, sought=sought)
-        return self._sought[key] if sought else program
+        return self._sought[key]
 
     def _starts(self, program: Program, asked: Asked, patient: bool) -> list[Start]:
         """The list of starts in a program, in their order; the last one only for who is

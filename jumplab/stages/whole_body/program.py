@@ -217,12 +217,14 @@ class Program(Shown):
         return [x for x in met if left & {x.pair.first.body, x.pair.second.body}]
 
     def limits_of(self, asked: Asked, solved: Solved) -> Iterator[tuple]:
-        """What binds in a ``solved`` motion, see :func:`jumplab.ocp.posing.binding`."""
+        """What binds in a ``solved`` motion: (name, column, shares, multipliers, limits) of each
+        limit, see :func:`jumplab.ocp.posing.binding`.
+        """
         a, posed, _ = self._posed(asked, solved)
         return binding(a, posed, solved.solution.multipliers)
 
     def cost_of(self, asked: Asked, solved: Solved) -> float:
-        """What the least cost is, to first order, where ``solved`` is of a program like this one
+        """The least cost [1], to first order, where ``solved`` is of a program like this one
         with other numbers; see :func:`jumplab.ocp.posing.lagrangian`.
         """
         a, posed, guess = self._posed(asked, solved)
@@ -238,7 +240,7 @@ class Program(Shown):
         return a, pose(a, parameters, guess, references, weights), guess
 
     def found(self, task: JumpTask, solved: Solved) -> JumpTask:
-        """The target that a solution has reached: ``task`` with what was sought."""
+        """The target that a solution has reached: ``task`` with what was sought [m, rad]."""
         if not self.sought:
             return task
         found = next(iter(solved.solution.phases.values())).constants
