@@ -40,13 +40,16 @@ LONG_S = 1.5  # of standing between two motions, of which one is mended
 MERGED_S = 0.12  # phases that are shorter are events of one ...
 SHUFFLED_S = 0.2  # as are those on one foot between two on both feet
 TOES_S = 0.1  # on the toes before a flight, but at most half of the phase
-# steps [s] of phases on flat feet, where a foot lands, on the toes, in flight; least number of them
+# steps [s] of phases on flat feet, where a foot lands, on the toes, in flight, with which motions
+# keep their limits between the nodes as well; least and largest number of them
 STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.014, FLIGHT: 0.024}
 LEAST_STEPS = 6
 MOST_STEPS = 90
 # shares of a phase's time within which it may be changed, on the ground and in flight; feet that
 # kinematics moves in no time need some of it
 STRETCH = (0.6, 1.5)
+# a flight keeps its time, for clips fly too long for their rise; one that is too short for clearance
+# may last as long as this
 FLIGHT_STRETCH = (0.86, 1.15)
 SHORT_FLIGHT_S = 0.3
 FREE_M = (0.15, 0.15)  # by which footholds may move
