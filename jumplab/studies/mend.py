@@ -48,7 +48,7 @@ MOST_STEPS = 90
 # shares of a phase's time within which it may be changed, on the ground and in flight; feet that
 # kinematics moves in no time need some of it
 STRETCH = (0.6, 1.5)
-# a flight keeps its time, for clips fly too long for their rise; one that is too short for clearance
+# a flight keeps its time, for clips fly too long for their rise; one too short for clearance
 # may last as long as this
 FLIGHT_STRETCH = (0.86, 1.15)
 SHORT_FLIGHT_S = 0.3
