@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jumplab as jl
-from jumplab.errors import RobotError
+from jumplab.errors import RobotError, nearest
 from jumplab.robot import Robot
 from jumplab.robot.files import ROLES
 from jumplab.robot_import.urdf import have_published
@@ -163,7 +163,6 @@ def test_published_robots_take_the_same_changes(name):
 
 
 # refused --------------------------------------------------------------------------------------------------------
-NAMES = ", ".join(BHR.joint_names)
 NOWHERE = "nor can it with knees at 0.3 ... 1.2 and the trunk at 0 ... 0.3 rad in [stance]: correct its ranges or its "
 NOWHERE += "soles"
 REFUSED = [
@@ -173,7 +172,7 @@ REFUSED = [
     ("with_limits", {"speed": "1"}, "the factor on speed must be a positive number, got '1'"),
     ("with_limits", {"speed": {"knee": True}}, "the factor on speed of 'knee' must be a positive number, got True"),
     ("with_limits", {"effort": {"kneee": 2.0}}, "the factors on effort name 'kneee', which is none of the roles hip, "
-     f"knee, ankle, shoulder, or the joints {NAMES}"),
+     f"knee, ankle, shoulder, or the joints {nearest(BHR.joint_names, 'kneee')}"),
     ("with_limits", {"joints": [("knee", 2.0)]},
      "the ranges must be a mapping from joints or roles, got [('knee', 2.0)]"),
     ("with_limits", {"joints": {"knee": {"low": 0.1}}},

@@ -229,7 +229,7 @@ FIT = {
     "tops": {0.3: 0.2}, "patience_s": 1.0, "stand_s": 0.1,
     "urdf": "<robot/>", "config_text": "", "color": "#102030", "share": 0.5,
 }  # fmt: skip
-SLOW = "run_trials", "run_chain", "mend", "Atlas.build", "Planner.plan", "Planner.replan", "plan", "simulate"
+SLOW = "record", "run_trials", "run_chain", "mend", "Atlas.build", "Planner.plan", "Planner.replan", "plan", "simulate"
 
 
 def public(robot):

@@ -20,7 +20,7 @@ from jumplab.auditing.contact import collisions
 from jumplab.auditing.dynamics import joints
 from jumplab.auditing.replay import Replay, norm, replay, runs
 from jumplab.auditing.report import METHOD, AuditReport, Measure
-from jumplab.errors import InputError
+from jumplab.errors import InputError, as_path
 from jumplab.io.clip import ENDINGS, Clip, read_clips
 from jumplab.io.folder import versions
 from jumplab.io.tape import Tape
@@ -101,7 +101,7 @@ def judge(
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
     if not isinstance(motion, str | Path):
         return _judged(Clip.of(motion, robot, fps))
-    path = Path(motion)
+    path = as_path(motion, "a clip")
     paths = [path]
     if path.is_dir():
         paths = sorted(x for x in path.iterdir() if x.suffix in ENDINGS)

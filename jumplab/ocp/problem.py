@@ -140,9 +140,9 @@ class Term:
                 f"term {self.name!r}: skip is for constraints at 'node'; a cost at {self.at!r} has "
                 "no use of it"
             )
-        if self.at not in PLACES:
+        if not isinstance(self.at, str) or self.at not in PLACES:
             raise InputError(
-                f"term {self.name!r}: at = {self.at!r}, must be one of {', '.join(PLACES)}"
+                f"term {self.name!r}: at = {quoted(self.at)}, must be one of {', '.join(PLACES)}"
             )
 
     @property

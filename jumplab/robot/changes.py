@@ -185,7 +185,7 @@ def _joints(robot: Robot, given: Mapping, where: str) -> list[tuple[str, Sequenc
         elif key not in roles:
             raise robot.error(
                 f"{where} name {quoted(key)}, which is none of the roles "
-                f"{', '.join(SAGITTAL_JOINTS)}, or the joints {', '.join(robot.joint_names)}"
+                f"{', '.join(SAGITTAL_JOINTS)}, or the joints {nearest(robot.joint_names, key)}"
             )
         elif not robot.joints[roles[key]]:
             raise robot.error(f"{where} name {key!r}, a role without joints: its arms are held")

@@ -26,6 +26,7 @@ TIMES = {
     FLIGHT: (0.5, 1.5, 0.8),
 }
 INTERVALS = {"two feet": 12, "one foot": 12, "toes": 6, FLIGHT: 12}
+MOST = 30  # steps or jumps in a row; a program of more is too large to solve
 STEP_SHARE = 0.33  # of the leg: a step or hop of usual length
 
 
@@ -269,7 +270,8 @@ class Contacts:
 
     @classmethod
     def run_up(cls, robot: Robot, steps: int = 1, step_m: float | None = None) -> Contacts:
-        """One or more steps of ``step_m`` [m], then off one foot, and down on both."""
+        """``steps`` (0 to 30) of ``step_m`` [m], then off one foot, and down on both."""
+        _check_count("steps", steps, 0)
         d = _step(robot, step_m)
         words = ["LR", "L"]
         ahead = [d * (1 + 0.9 * k) for k in range(steps)]
@@ -295,6 +297,7 @@ class Contacts:
     @classmethod
     def bound(cls, robot: Robot, jumps: int = 2, jump_m: float | None = None) -> Contacts:
         """Jumps of ``jump_m`` [m] off both feet and down on both, in a row."""
+        _check_count("jumps", jumps, 1)
         d = _step(robot, jump_m)
         places = [Place((1 + k // 2) * d) for k in range(2 * jumps)]
         return cls.of("LR" + " lr - LR" * jumps, robot, places)
@@ -341,6 +344,11 @@ def jump_contacts(limits: Limits, mesh: Mesh) -> Contacts:
 
 def _step(robot: Robot, given_m: float | None) -> float:
     return STEP_SHARE * leg_length(robot) if given_m is None else given_m
+
+
+def _check_count(name: str, count: int, least: int) -> None:
+    if not least <= count <= MOST:
+        raise InputError(f"{name} = {quoted(count)} is outside {least} ... {MOST}")
 
 
 def _off(robot: Robot, given_m: float | None) -> float:
