@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # help of a command is there before NumPy is
 F = TypeVar("F", bound=Callable)
 FLAGS = "bool", "bool_"
 RECEIVERS = "self", "cls"
+PLACES = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
 UNKNOWN = inspect.Parameter.empty  # an annotation that cannot be checked
 
 
@@ -83,9 +84,21 @@ def checked(of: F) -> F:
 def _checking(function: F) -> F:
     signature = inspect.signature(function)
     called = function.__qualname__.removesuffix(".__init__")
+    places = [x for x in signature.parameters.values() if x.kind in PLACES]
+    least = sum(x.default is UNKNOWN for x in places)
+    needed = any(
+        x.kind not in PLACES and x.default is UNKNOWN for x in signature.parameters.values()
+    )
+    hints: list[Any] = []
 
     @wraps(function)
     def checking(*args: Any, **options: Any) -> Any:
+        # a control loop calls a thousand times for each simulated second
+        if not options and not needed and least <= len(args) <= len(places):
+            if not hints:
+                hints.extend(_hint(x.annotation, function) for x in places)
+            if all(map(_fits, args, hints)):
+                return function(*args)
         try:
             given = signature.bind(*args, **options)
         except TypeError as e:
@@ -102,6 +115,19 @@ def _checking(function: F) -> F:
         return function(*given.args, **given.kwargs)
 
     return checking
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """True where a look at the type shows that a value is already as its ``hint`` has it."""
+    if hint is UNKNOWN or hint is Any:
+        return True
+    if type(value) is not hint:
+        return False
+    if hint is float:
+        return math.isfinite(value)
+    if hint.__name__ == "ndarray":
+        return value.dtype.kind in "fiu" and value.ndim > 0
+    return hint in (int, bool, str) or hint.__module__.startswith("jumplab.")
 
 
 def _hint(annotation: Any, function: Callable) -> Any:

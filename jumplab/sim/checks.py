@@ -262,7 +262,7 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[float, float]:
     least = 0.0
     if not (hard and ground.plain):
         corners = before[:, None, :3, 3] + robot.foot.corners @ before[:, :3, :3].swapaxes(1, 2)
-        sunk = np.array([sunk[0], [ground.depth_of(points, soft=hard) for points in corners]])
+        sunk = np.array([sunk[0], ground.depth_of(corners, soft=hard)])
         # usual contacts act in the middle of the depth, beyond the tip of a tilted sole
         least = 0.0 if hard else sunk[1] / 2
     beyond = [
@@ -289,7 +289,7 @@ def friction_used(force: np.ndarray, place: np.ndarray, ground: Scene) -> np.nda
     """
     up = np.array([[0.0, 0.0, 1.0]])
     if not ground.plain:
-        up = np.array([ground.normal_at(point) for point in place])
+        up = ground.normals_at(place)
     across = (force * up).sum(axis=1)
     return np.linalg.norm(force - across[:, None] * up, axis=1) / across
 

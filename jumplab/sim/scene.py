@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -66,8 +65,10 @@ class Block:
         """Whether its top is level."""
         return self.pitch_rad == self.roll_rad == 0
 
-    def height_at(self, x: float, y: float = 0.0) -> float:
-        """Height of the plane of its top at ``x``, and ``y`` to the left of the jump [m]."""
+    def height_at(self, x: float | np.ndarray, y: float | np.ndarray = 0.0) -> float | np.ndarray:
+        """Height of the plane of its top at ``x``, and ``y`` to the left of the jump [m]; arrays
+        (...) for arrays.
+        """
         a, b, c = self.turn[:, 2]
         return self.top - (a * (x - self.pivot_m) + b * y) / c
 
@@ -183,37 +184,54 @@ class Scene:
 
     def top_at(self, x: float, y: float = 0.0) -> float:
         """Height of the highest surface at ``x``, and ``y`` to the left of the jump [m]."""
-        return self._at(x, y)[1]
+        return float(self._highest(np.array([x, y]))[1])
 
-    def _at(self, x: float, y: float) -> tuple[Block, float]:
-        """The highest block there, and the height of its top [m]; far below, there is one."""
-        here = [b for b in self.blocks if b.x_from <= x <= b.x_to and b.y_from <= y <= b.y_to]
-        tops = [(block, block.height_at(x, y)) for block in here]
-        return max(tops, key=itemgetter(1), default=(NOTHING, NOTHING.top))
+    def _highest(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of the highest block at ``places`` (..., 2) along the jump and to its left [m]: its
+        number (...), that after the last where there is no ground, and the height (...) of its
+        top [m].
+        """
+        x, y = np.moveaxis(places, -1, 0)
+        tops = [
+            np.where(
+                (b.x_from <= x) & (x <= b.x_to) & (b.y_from <= y) & (y <= b.y_to),
+                b.height_at(x, y),
+                -np.inf,
+            )
+            for b in self.blocks
+        ]
+        tops = np.array([*tops, np.full(x.shape, NOTHING.top)])
+        number = tops.argmax(axis=0)
+        return number, np.take_along_axis(tops, number[None], axis=0)[0]
 
     def below(self, point: np.ndarray) -> tuple[Block, float]:
         """The highest block at a ``point`` (3,) of the world, and the height of its top [m]."""
-        return self._at(*self.along(point))
+        number, top = self._highest(self.along(shaped(point, (3,), "the point")))
+        return (*self.blocks, NOTHING)[number], float(top)
 
-    def normal_at(self, point: np.ndarray) -> np.ndarray:
-        """(3,) upward, across the top below a ``point`` (3,) of the world."""
-        return about_vertical(self.along_rad) @ self.below(point)[0].turn[:, 2]
+    def normals_at(self, points: np.ndarray) -> np.ndarray:
+        """(k, 3) upward, across the tops below ``points`` (k, 3) of the world."""
+        number, _ = self._highest(self.along(points))
+        normals = np.array([block.turn[:, 2] for block in (*self.blocks, NOTHING)])
+        return normals[number] @ about_vertical(self.along_rad).T
 
-    def depth_of(self, points: np.ndarray, soft: bool = True) -> float:
-        """How deep the lowest of some ``points`` (k, 3) of the world lies in the ground, in
-        ``soft`` ground alone if wanted [m].
+    def depth_of(self, points: np.ndarray, soft: bool = True) -> np.ndarray:
+        """How deep (...) the lowest of each k ``points`` (..., k, 3) of the world lies in the
+        ground, in ``soft`` ground alone if wanted [m].
         """
-        depths = [0.0]
-        for point in points:
-            block, top = self.below(point)
-            if block.soft_m or not soft:
-                depths.append(top - float(point[2]))
-        return max(depths)
+        number, top = self._highest(self.along(points))
+        deep = top - points[..., 2]
+        if soft:
+            deep = np.where(np.array([b.soft_m for b in (*self.blocks, NOTHING)])[number], deep, 0)
+        return deep.max(axis=-1, initial=0.0)
 
-    def along(self, point: np.ndarray) -> tuple[float, float]:
-        """Place of a ``point`` (3,) along the heading of the landing, and to its left [m]."""
-        x, y, _ = about_vertical(-self.along_rad) @ shaped(point, (3,), "the point")
-        return float(x), float(y)
+    def along(self, points: np.ndarray) -> np.ndarray:
+        """Places (..., 2) of ``points`` (..., 3) along the heading of the landing, and to its left
+        [m].
+        """
+        if points.shape[-1:] != (3,):
+            raise InputError(f"points must have the shape (..., 3), got {points.shape}")
+        return points @ about_vertical(self.along_rad)[:, :2]
 
     def landing_moved(
         self,
