@@ -10,6 +10,7 @@ import pinocchio as pin
 from jumplab.ocp.qp import Qp, QpSolver
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet, point_motion, wrench_rows
+from jumplab.robot.legs import size
 
 PERIOD_STEPS = 2  # 500 Hz
 WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns are of order 1 to 10
@@ -28,10 +29,11 @@ class WholeBody:
     wrench right).
 
     Wrenches act at a point of each foot, the middle of the sole unless told, world axes, force then
-    moment, in units of :data:`WRENCH_SCALE`.
+    moment, in units of :data:`WRENCH_SCALE` for the robot's size.
 
     Attributes
     ----------
+    size : of the robot, by which its controllers scale their numbers.
     unknowns : (nx, nx), rows of the unknowns themselves.
     com, com_velocity : (3,) [m, m/s];  momentum : (3,) angular momentum about the CoM [kg m^2/s].
     trunk : (3, 3) attitude of the base.
@@ -47,6 +49,9 @@ class WholeBody:
         self._data = self._model.createData()
         self._middles = on_feet(robot, robot.foot.center)
         self.motors = robot.limits
+        self.size = size(robot)
+        self._unit = self.size.of(WRENCH_SCALE, "N")
+        self._inertia = self.size.of(NOMINAL_INERTIA, "kg m^2")
         self.nv = self._model.nv
         self.nx = self.nv + 12
         self.mass = robot.total_mass
@@ -82,7 +87,7 @@ class WholeBody:
         """Let only the feet flagged in ``contact`` (2,) transmit wrenches."""
         for side in (0, 1):
             at = self.nv + 6 * side
-            unit = WRENCH_SCALE * float(contact[side])
+            unit = self._unit * float(contact[side])
             self._dynamics[:, at : at + 6] = -unit * self.sole_rows[side, :, : self.nv].T
             self.force_rows[AXES, at + AXES] = unit / self.mass
             self.momentum_rows[:, at : at + 3] = unit * pin.skew(self.soles[side] - self.com)
@@ -111,8 +116,8 @@ class WholeBody:
         [N m]; the latter's weight is of that over a nominal inertia.
         """
         qp.cost("CoM", self.force_rows, com - self.gravity, weights[0])
-        rows = self.momentum_rows / NOMINAL_INERTIA
-        qp.cost("momentum", rows, momentum / NOMINAL_INERTIA, weights[1])
+        rows = self.momentum_rows / self._inertia
+        qp.cost("momentum", rows, momentum / self._inertia, weights[1])
 
     def torque(self, x: np.ndarray) -> np.ndarray:
         """Joint torques (nv - 6,) that go with the unknowns ``x`` (nx,) [N m]."""
@@ -123,7 +128,7 @@ class WholeBody:
         nothing moves [N m].
         """
         x = np.zeros(self.nx)
-        share = self.mass * -self.gravity[2] / WRENCH_SCALE / max(1, int(np.sum(contact)))
+        share = self.mass * -self.gravity[2] / self._unit / max(1, int(np.sum(contact)))
         x[self.nv + 2 :: 6] = share * np.asarray(contact)
         return self.torque(x)
 

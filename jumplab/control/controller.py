@@ -146,8 +146,10 @@ class Controller:
         self.ahead = LandingAhead(robot, landing if flies else "spring", again=flip)
         self._reaim = Reaim(robot, tape, legs_alone=flip) if reaim and flies else None
         self._shifts = reaim and flip
-        self._yield_s = (FLIP_YIELD_S if flip else YIELD_S) + hardware.delay_s
-        self._touches_n = max(TOUCHDOWN_FORCE_N, SURE * np.sqrt(2) * hardware.force_noise_n)
+        size = self.landing.body.size
+        self._yield_s = size.of(FLIP_YIELD_S if flip else YIELD_S, "s") + hardware.delay_s
+        touches_n = size.of(TOUCHDOWN_FORCE_N, "N")
+        self._touches_n = max(touches_n, SURE * np.sqrt(2) * hardware.force_noise_n)
         self._looks_from = round(_looks_from_s(tape, self._awaited) / STEP_S)
         self.last_step = self.playback.steps + round(WAIT_S / STEP_S)
 
@@ -227,7 +229,7 @@ class Controller:
         time = since * STEP_S
         if self.ahead.again and self.ahead.followed == "planned" and self.stepped_s is None:
             landing.reference = self.ahead.follow(time, q, v, landing.reference)
-        every = PERIOD_STEPS if time < SETTLING_S else CALM_STEPS
+        every = PERIOD_STEPS if time < landing.body.size.of(SETTLING_S, "s") else CALM_STEPS
         if since % every == 0:
             self._tau = landing.torque(time, q, v, wrench[:, 2])
         return Command(tau=self._tau)

@@ -17,6 +17,7 @@ import pinocchio as pin
 from jumplab.control import STEP_S
 from jumplab.control.kinematics import LEVEL, Gauge, rotation
 from jumplab.robot import Robot
+from jumplab.robot.legs import size
 
 
 @dataclass(frozen=True)
@@ -124,8 +125,13 @@ class Estimator:
         floors = vars(FLOOR)
         n = SensorNoise(**{name: max(x, floors[name]) for name, x in vars(noise).items()})
         self._noise = n
-        self._leg = (n.joint_rad * LEG_M) ** 2 * np.eye(3)  # variance of a foot's place
-        self._loaded_n = max(LOADED_N, SURE * n.force)
+        large = size(robot)
+        self._tipped_m = large.of(TIPPED_M, "m")
+        self._settle_s = large.of(SETTLE_S, "s")
+        self._leg = (n.joint_rad * large.of(LEG_M, "m")) ** 2 * np.eye(
+            3
+        )  # variance of a foot's place
+        self._loaded_n = max(large.of(LOADED_N, "N"), SURE * n.force)
         spread = np.repeat([n.tilt_rad, 1e-3, 1e-3, n.gyro_bias, n.accel_bias, 1e-3, 1e-3], 3)
         self._cov = np.diag(spread**2)
 
@@ -155,7 +161,7 @@ class Estimator:
         drive[TURN] = (self._noise.gyro * STEP_S) ** 2
         drive[SPEED] = (self._noise.accel * STEP_S) ** 2
         for foot, steps in zip(FEET, self._standing, strict=True):
-            walk = SETTLE_WALK if steps * STEP_S < SETTLE_S else FOOT_WALK
+            walk = SETTLE_WALK if steps * STEP_S < self._settle_s else FOOT_WALK
             drive[foot] = walk**2 * STEP_S
         self._cov = step @ self._cov @ step.T + np.diag(drive)
 
@@ -174,7 +180,7 @@ class Estimator:
         arms = ends @ self._attitude.T  # (2, 3) world axes, from the trunk
         end = self._end[side]
         lower = int(arms[1, 2] < arms[0, 2])
-        tipped = lower != end and abs(arms[1, 2] - arms[0, 2]) > TIPPED_M
+        tipped = lower != end and abs(arms[1, 2] - arms[0, 2]) > self._tipped_m
         if self._standing[side] == 0 or tipped:
             self._end[side] = end = lower
             self._plant(side, arms[end])

@@ -8,7 +8,7 @@ CoM, angular momentum, trunk, feet flat and still, posture.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +18,7 @@ from jumplab.control.kinematics import Gauge
 from jumplab.control.step import RecoveryStep
 from jumplab.ocp.qp import Qp
 from jumplab.robot import Robot
+from jumplab.robot.legs import Size
 from jumplab.robot.stance import stance_configuration
 from jumplab.stages.srmp.landing import LandingPlan
 
@@ -35,7 +36,6 @@ STOP_LEAVE = 10.0  # [rad/s^2] ... and if it is wished elsewhere, at least so mu
 # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
 MAX_SHIFT = 60.0
 MAX_TURN = 300.0
-MOST = np.repeat([MAX_SHIFT, MAX_TURN], 3)
 MAX_STEP = 150.0  # [m/s^2] of a foot that steps: 0.5 m in 0.24 s begin with 50
 # [0.1 mN m] ProxQP's last digits depend on where its memory lies; rounded, runs are the same
 TORQUE_DIGITS = 4
@@ -72,8 +72,28 @@ class LandingGains:
     wrench_weight: float = 1e-3  # [1 / (100 N)^2]
     acceleration_weight: float = 1e-4
 
+    def of(self, size: Size) -> LandingGains:
+        """Those of a robot of another ``size``, whose landing they make alike."""
+        turning = size.of(1.0, "s") ** 4
+        pairs = {
+            name: (moving, turning * weight)
+            for name in FOOT_WEIGHTS
+            for moving, weight in [getattr(self, name)]
+        }
+        rates = {name: size.of(getattr(self, name), "rad/s") for name in RATES}
+        others = {name: turning * getattr(self, name) for name in TURNING_WEIGHTS}
+        return replace(self, **rates, **others, **pairs)
 
-GAINS = LandingGains()
+
+# fields of the gains by their unit: natural frequencies, weights of a foot's motion and turning,
+# weights of angular accelerations
+RATES = [name for name in vars(LandingGains()) if "_rate" in name]
+FOOT_WEIGHTS = "foot_weight", "swing_weight", "step_weight"
+TURNING_WEIGHTS = [
+    *("momentum_weight", "trunk_weight", "arm_posture_weight", "leg_posture_weight"),
+    *("lateral_posture_weight", "stop_weight"),
+]
+GAINS = LandingGains()  # of a robot of size one
 
 
 class LandingController:
@@ -95,23 +115,30 @@ class LandingController:
         force_noise_n: float = 0.0,
     ):
         self._may_step = may_step
+        self.body = body = WholeBody(robot)
+        self.gains = GAINS.of(body.size)
+        self._horizon_s = body.size.of(STOP_HORIZON_S, "s")
+        self._leave = body.size.of(STOP_LEAVE, "rad/s^2")
+        self._most_turn = body.size.of(MAX_TURN, "rad/s^2")
+        self._hovers_m = body.size.of(NEAR_GROUND_M, "m")
+        self._damping = body.size.of(FALLBACK_DAMPING, "N m s")
         self.step = RecoveryStep(robot, SOLE_SHARE, force_noise_n)
         self.solver = solver()
-        self._loaded_n = max(CONTACT_FORCE_N, LIKELY * force_noise_n)
-        self.body = WholeBody(robot)
+        self._loaded_n = max(body.size.of(CONTACT_FORCE_N, "N"), LIKELY * force_noise_n)
         weights = {
-            name: GAINS.leg_posture_weight for pair in robot.joints.values() for name in pair
+            name: self.gains.leg_posture_weight for pair in robot.joints.values() for name in pair
         }
-        weights |= dict.fromkeys(robot.joints["shoulder_pitch"], GAINS.arm_posture_weight)
-        side = GAINS.lateral_posture_weight
+        weights |= dict.fromkeys(robot.joints["shoulder_pitch"], self.gains.arm_posture_weight)
+        side = self.gains.lateral_posture_weight
         self._posture_weight = np.array([weights.get(name, side) for name in robot.joint_names])
         self._corners = corner_rows(robot, PLANNED_FRICTION, *SOLE_SHARE)
         self._last_contact = np.full(2, -np.inf)
         # accelerations, wrenches, and what these differ by
-        nv = self.body.nv
-        wrenches = self.body.unknowns[nv:]
-        self._effort_rows = np.vstack([self.body.unknowns, wrenches[:6] - wrenches[6:]])
-        weights = (GAINS.acceleration_weight, GAINS.wrench_weight, GAINS.uneven_weight)
+        nv = body.nv
+        wrenches = body.unknowns[nv:]
+        self._effort_rows = np.vstack([body.unknowns, wrenches[:6] - wrenches[6:]])
+        g = self.gains
+        weights = (g.acceleration_weight, g.wrench_weight, g.uneven_weight)
         self._effort_weight = np.repeat(weights, [nv, 12, 6])
         rest = stance_configuration(robot)
         self._rest = rest[7:].copy()
@@ -137,7 +164,7 @@ class LandingController:
         if answer.solved:
             tau = body.torque(answer.x)
         else:
-            tau = body.gravity_torque(contact) - FALLBACK_DAMPING * v[6:]
+            tau = body.gravity_torque(contact) - self._damping * v[6:]
         return np.clip(np.round(tau, TORQUE_DIGITS), *body.motors.range(v[6:]))
 
     def standing(self, time: float, foot_force: np.ndarray) -> np.ndarray:
@@ -151,11 +178,11 @@ class LandingController:
         if not loaded.any():
             return loaded
         height = self.body.soles[:, 2]
-        return loaded | (height - height[loaded].min() < NEAR_GROUND_M)
+        return loaded | (height - height[loaded].min() < self._hovers_m)
 
     def _program(self, time: float, q: np.ndarray, v: np.ndarray, contact: np.ndarray) -> Qp:
         """The QP of one moment."""
-        g = GAINS
+        g = self.gains
         body = self.body
         qp = body.program(v, self._corners)
         ground = body.soles[contact] if contact.any() else body.soles
@@ -181,7 +208,8 @@ class LandingController:
     def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Wished CoM acceleration (3,) and rate of angular momentum (3,)."""
         body = self.body
-        rate = np.array([GAINS.com_rate_xy, GAINS.com_rate_xy, GAINS.com_rate_z])
+        g = self.gains
+        rate = np.array([g.com_rate_xy, g.com_rate_xy, g.com_rate_z])
         goal = foot_middle + np.array([0.0, 0.0, self._height])
         speed, momentum, push, twist = np.zeros((4, 3))
         if self.reference is not None:
@@ -189,13 +217,13 @@ class LandingController:
             goal[[0, 2]] = foot_middle[[0, 2]] + com
             push[[0, 2]], twist[1] = self.reference.feed_forward(time)
         wish = push + rate**2 * (goal - body.com) + 2 * rate * (speed - body.com_velocity)
-        return wish, twist + GAINS.momentum_rate * (momentum - body.momentum)
+        return wish, twist + g.momentum_rate * (momentum - body.momentum)
 
     def _trunk_wish(self, v: np.ndarray) -> np.ndarray:
         """Angular acceleration (3,) of the trunk in its own axes: upright in roll and pitch, yaw
         only damped.
         """
-        rate = GAINS.trunk_rate
+        rate = self.gains.trunk_rate
         trunk = self.body.trunk
         goal = pin.rpy.rpyToMatrix(0.0, self._rest_pitch, np.arctan2(trunk[1, 0], trunk[0, 0]))
         return rate**2 * pin.log3(trunk.T @ goal) - 2 * rate * v[3:6]
@@ -204,7 +232,7 @@ class LandingController:
         """Acceleration (6,) of a sole: flat and still; a foot in the air is also led down to the
         ground.
         """
-        rate = GAINS.foot_rate
+        rate = self.gains.foot_rate
         body = self.body
         attitude = body.attitudes[side]
         wish = -2 * rate * body.twists[side]
@@ -213,24 +241,25 @@ class LandingController:
         if not standing:
             wish[:2] += 2 * rate * body.com_velocity[:2]
             wish[2] += rate**2 * (ground_height - body.soles[side, 2])
-        return np.clip(wish, -MOST, MOST)
+        most = np.repeat([MAX_SHIFT, self._most_turn], 3)
+        return np.clip(wish, -most, most)
 
     def posture_wish(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Wished joint accelerations (nv - 6,) [rad/s^2] and their weights at q (nq,), v (nv,);
         near a stop the wish is to turn back in time.
         """
-        rate = GAINS.posture_rate
+        rate = self.gains.posture_rate
         motors = self.body.motors
         wish = rate**2 * (self._rest - q[7:]) - 2 * rate * v[6:]
         weight = self._posture_weight.copy()
-        ahead = q[7:] + v[6:] * STOP_HORIZON_S
+        ahead = q[7:] + v[6:] * self._horizon_s
         for stop, way in ((motors.lower, 1.0), (motors.upper, -1.0)):
-            needed = 2 * (way * (stop - ahead) + STOP_MARGIN_RAD) / STOP_HORIZON_S**2
+            needed = 2 * (way * (stop - ahead) + STOP_MARGIN_RAD) / self._horizon_s**2
             near = needed > 0
             if not near.any():
                 continue
             # or a joint that is to go back would rest just there
-            away = np.clip(way * wish, 0.0, STOP_LEAVE)
-            wish[near] = way * np.clip(np.maximum(needed, away), 0.0, MAX_TURN)[near]
-            weight[near] = GAINS.stop_weight
+            away = np.clip(way * wish, 0.0, self._leave)
+            wish[near] = way * np.clip(np.maximum(needed, away), 0.0, self._most_turn)[near]
+            weight[near] = self.gains.stop_weight
         return wish, weight

@@ -94,7 +94,16 @@ class LaunchFeedback:
         self.solver = solver()
         self.off_m = 0.0
         air_s = [np.ptp(tape.t[rows]) for rows in tape.flights]
-        self._fade_rate = max([FADE_RATE, *(FADED / (FADE_SHARE * x) for x in air_s)])
+        size = self._body.size
+        self._rolling = round(size.of(ROLLING_S, "s") / STEP_S)
+        self._most_off_m = size.of(MOST_OFF_M, "m")
+        self._com_rate, self._momentum_rate, self._posture_rate, fade_rate = (
+            size.of(x, "rad/s") for x in (COM_RATE, MOMENTUM_RATE, POSTURE_RATE, FADE_RATE)
+        )
+        self._turning = size.of(1.0, "s") ** 4  # on weights of angular accelerations
+        self._most = size.of(MOST, "rad/s^2")
+        self._reading = np.array([READING[0], size.of(READING[1], "m")])
+        self._fade_rate = max([fade_rate, *(FADED / (FADE_SHARE * x) for x in air_s)])
         # of the joints, off the tape
         self.angles, self._rates, self.changes = np.zeros((3, len(robot.joint_names)))
         self._none = np.zeros(len(robot.joint_names))
@@ -102,7 +111,8 @@ class LaunchFeedback:
         self._farthest = 0.0  # [rad]
         # mass on the trunk [kg], and that times its place ahead of and above the base [kg m]
         self._load = np.zeros(3)
-        self._spread = np.diag(np.square(PRIOR)) * robot.total_mass**2
+        prior = np.array([PRIOR[0], *size.of(np.array(PRIOR[1:]), "m")])
+        self._spread = np.diag(np.square(prior)) * robot.total_mass**2
         self._forward, self._left = about_vertical(self._gauge.heading(tape.q[0])).T[:2]
         self._first = tape.q[0]
         self.rows = self._planned(tape)
@@ -172,12 +182,12 @@ class LaunchFeedback:
             self.changes = self._back(self._fade_rate)
             self._torque = self._none
         elif step % PERIOD_STEPS == 0:
-            ahead = step + round(ROLLING_S / STEP_S)
+            ahead = step + self._rolling
             # an impact says nothing of loads
             if ahead < self.playback.lands and self.playback.stands(ahead) == FLAT:
                 self._feel(state, self.rows[step])
             if self.rows[due, 2, 2] + self._robot.gravity < LEAST_LOAD * self._robot.gravity:
-                self.changes = -2 * POSTURE_RATE * self._rates
+                self.changes = -2 * self._posture_rate * self._rates
             else:
                 self.changes, tau = self._solve(due, stand, *(command.state or state[:2]))
                 self._torque = self._none if tau is None else tau - command.tau
@@ -208,12 +218,12 @@ class LaunchFeedback:
         arms = np.array([state.q[:3] - com, axes[:, 0], axes[:, 2]])
         sense = np.array([[pull[2], 0.0, 0.0], np.cross(arms, pull) @ self._left])
         readings = np.array([push - mass * (planned[2, 2] + gravity), felt @ self._left])
-        noise = np.diag(np.square(np.multiply(READING, push)))
+        noise = np.diag(np.square(self._reading * push))
         gain = np.linalg.solve(sense @ self._spread @ sense.T + noise, sense @ self._spread).T
         self._load = self._load + gain @ (readings - sense @ self._load)
         self._spread = self._spread - gain @ sense @ self._spread
         ahead = float(self._forward @ arms.T @ self._load) / (mass + float(self._load[0]))
-        self.off_m = float(np.clip(ahead, -MOST_OFF_M, MOST_OFF_M))
+        self.off_m = float(np.clip(ahead, -self._most_off_m, self._most_off_m))
 
     def _solve(
         self, due: int, stand: Stand, q: np.ndarray, v: np.ndarray
@@ -235,17 +245,17 @@ class LaunchFeedback:
         ahead = self.off_m * self._forward
         # that the real CoM takes besides
         moment = np.cross(ahead, body.mass * (push - body.gravity))
-        shift = COM_RATE**2 * (com - ahead - body.com)
-        shift = shift + 2 * COM_RATE * (speed - body.com_velocity)
-        turn = spin + moment + MOMENTUM_RATE * (momentum - body.momentum)
+        shift = self._com_rate**2 * (com - ahead - body.com)
+        shift = shift + 2 * self._com_rate * (speed - body.com_velocity)
+        turn = spin + moment + self._momentum_rate * (momentum - body.momentum)
         tape = self.playback.acceleration(due)
-        back = self._back(POSTURE_RATE)
+        back = self._back(self._posture_rate)
         qp = body.program(v, np.vstack(corners), moment)
-        body.balance(qp, push + shift, turn, (COM_WEIGHT, MOMENTUM_WEIGHT))
-        posture = np.full(len(back), POSTURE_WEIGHT)
+        body.balance(qp, push + shift, turn, (COM_WEIGHT, self._turning * MOMENTUM_WEIGHT))
+        posture = np.full(len(back), self._turning * POSTURE_WEIGHT)
         for side, x in enumerate(stand):
             if x == tapes.AIR:
-                posture[self._legs[side]] = SWING_WEIGHT
+                posture[self._legs[side]] = self._turning * SWING_WEIGHT
                 continue
             still = FOOT_WEIGHT * np.array([1.0, 1.0, 1.0, 1.0, float(x == tapes.FLAT), 1.0])
             qp.cost(f"foot {side}", body.sole_rows[side], -body.sole_drift[side], still)
@@ -259,7 +269,7 @@ class LaunchFeedback:
         self._spin = body.momentum_rows @ answer.x - moment
         change = np.round(answer.x[6 : body.nv], DIGITS) - tape
         tau = np.round(body.torque(answer.x), TORQUE_DIGITS) + body.motors.lost(v[6:])
-        return np.clip(change, -MOST, MOST), tau
+        return np.clip(change, -self._most, self._most), tau
 
     def _back(self, rate: float) -> np.ndarray:
         """Accelerations (nv - 6,) that lead the joints back to the tape, critically damped."""

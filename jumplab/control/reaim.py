@@ -16,7 +16,7 @@ from jumplab.control.kinematics import Gauge, Motion, about_vertical, turned, ya
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.contact import WORLD, on_feet
-from jumplab.robot.legs import leg_columns
+from jumplab.robot.legs import leg_columns, size
 from jumplab.robot.stance import knees
 
 START_S = 0.12  # before touchdown; earlier, the correction fights the swing itself
@@ -70,6 +70,8 @@ class Reaim:
 
     def __init__(self, robot: Robot, tape: Tape, legs_alone: bool = False):
         self._gauge = Gauge(robot)
+        large = size(robot)
+        self._slowest = large.of(FASTEST_FALL, "m/s")
         self._legs_alone = legs_alone
         self._anchors = on_feet(robot, robot.foot.center)
         names = robot.joint_names
@@ -77,6 +79,8 @@ class Reaim:
         self._legs = np.sort(np.concatenate(leg_columns(robot))) - 6
         self._pitching = np.isin(names, [name for name, _, _ in robot.role_signs()])
         self._is_arm = np.isin(names, robot.joints["shoulder_pitch"])
+        self._start_s = large.of(np.where(self._pitching, START_S, SIDE_START_S), "s")
+        self._most = STEP_S * large.of(np.where(self._pitching, RATE, SIDE_RATE), "rad/s")
         self._limbs = np.concatenate([self._legs, np.flatnonzero(self._is_arm)])
         self._low, self._high = self._range(robot)
         self._far = False
@@ -114,11 +118,10 @@ class Reaim:
         tilt = pin.log3(turn)[:2]
         ahead = tilt[1] > 0 and np.abs(tilt).max() > FAR_RAD
         self._far |= bool(ahead and not self._legs_alone)
-        start_s = np.where(self._pitching, START_S, SIDE_START_S)
-        moving = (left_s < start_s) | (self._is_arm & self._far)
+        moving = (left_s < self._start_s) | (self._is_arm & self._far)
         if np.any(moving):
-            most = STEP_S * np.where(self._pitching, RATE, SIDE_RATE)
-            step = np.clip(self.touchdown(now, turn, left_s)[0] - self._now, -most, most)
+            step = self.touchdown(now, turn, left_s)[0] - self._now
+            step = np.clip(step, -self._most, self._most)
             self._now = self._now + np.where(moving, step, 0.0)
         return self._now
 
@@ -130,7 +133,7 @@ class Reaim:
         """
         fall = self._gauge.robot.gravity * left_s - now.velocity[2] if left_s < np.inf else 0.0
         back = about_vertical(-yaw_of(turn))  # seen along the robot's heading
-        shifts = self._shifts(back @ now.velocity, back @ now.momentum, max(fall, FASTEST_FALL))
+        shifts = self._shifts(back @ now.velocity, back @ now.momentum, max(fall, self._slowest))
         correction, level = self._reached(self._places + shifts, back @ turn)
         return correction, back.T @ level
 

@@ -18,6 +18,7 @@ from jumplab.control import STEP_S
 from jumplab.errors import JumplabError
 from jumplab.ocp.cache import in_turn
 from jumplab.robot import Robot
+from jumplab.robot.legs import size
 from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
 
 # before touchdown a landing is planned: three times what the solve takes on one core of a laptop
@@ -57,7 +58,8 @@ class LandingAhead:
         self.followed: str | None = None
         self._planned: dict[str, float | None] = {}
         self._reason: str | None = None
-        self._due = FIRST_S
+        self._size = size(robot)
+        self._due = self._size.of(FIRST_S, "s")
         self._next: LandingPlan | None = None
         # plans made after the touchdown, states from which stage 1 found none, the longest solve
         self.again = dict(made=0, refused=0, slowest_s=0.0) if again else None
@@ -99,13 +101,17 @@ class LandingAhead:
         if self._next is not None and time >= self._next.t[0] + LATENCY_S - STEP_S / 2:
             reference = self._next
             self._next = None
-        if self._due - STEP_S / 2 <= time <= UNTIL_S:
+        if self._due - STEP_S / 2 <= time <= self._size.of(UNTIL_S, "s"):
             self._due += EVERY_S
             now = touchdown_of_state(self._robot, q, v, impact=False)
             com, velocity, _ = reference.at(time)
             # the capture point is x + v_x / rate
-            rate = np.sqrt(self._robot.gravity / max(now.com[1], LEAST_HEIGHT_M))
-            if abs(now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate) > OFF_M:
+            rate = np.sqrt(
+                self._robot.gravity / max(now.com[1], self._size.of(LEAST_HEIGHT_M, "m"))
+            )
+            if abs(
+                now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate
+            ) > self._size.of(OFF_M, "m"):
                 plan, _, spent_s = self._solve(now)
                 # from here stage 1 may know no landing; the older one is the best there is then
                 self._next = plan and replace(plan, t=plan.t + time)  # since touchdown

@@ -39,7 +39,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.io.tape import AIR, FLAT, TOE
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet, point_motion
-from jumplab.robot.legs import leg_columns
+from jumplab.robot.legs import leg_columns, size
 from jumplab.robot.stance import stance_configuration
 
 # of "pd": kp, kd [N m/rad, N m s/rad] of pitch joints, ...
@@ -140,7 +140,10 @@ class TorqueServo:
         self._data = robot.model.createData()
         role = {name: role for role, pair in robot.joints.items() for name in pair}
         gains = [GAINS.get(role.get(name), PITCH_GAINS) for name in robot.joint_names]
-        self._kp, self._kd = np.transpose(gains)
+        large = size(robot)
+        kp, kd = np.transpose(gains)
+        self._kp = large.of(kp, "N m")
+        self._kd = large.of(kd, "N m s")
         self._legs = [leg - 6 for leg in leg_columns(robot)]
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
@@ -181,7 +184,10 @@ class WholeBodyServo:
         self._model = robot.model
         self._data = self._model.createData()
         self._motors = robot.limits
-        self._damping = DAMPING * self._motors.effort / self._motors.effort.max()
+        large = size(robot)
+        self._give = GIVE * large.of(1.0, "N") ** -1
+        self._epsilon = EPSILON * large.of(1.0, "N") ** -2
+        self._damping = large.of(DAMPING, "N m s") * self._motors.effort / self._motors.effort.max()
         self._pivots = {FLAT: robot.foot.center, TOE: robot.foot.tip}
         self._anchors = {stand: on_feet(robot, at) for stand, at in self._pivots.items()}
 
@@ -230,11 +236,11 @@ class WholeBodyServo:
         kkt = np.zeros((12 + held, 12 + held))
         kkt[:6, :6] = base.T @ base
         kkt[:6, -6:] = kkt[-6:, :6] = mass[:6, :6]
-        kkt[6:-6, 6:-6] = EPSILON * np.eye(held)
+        kkt[6:-6, 6:-6] = self._epsilon * np.eye(held)
         kkt[-6:, 6:-6] = -push[:6]
         kkt[6:-6, -6:] = -push[:6].T
         still = -base.T @ (drift + feet[:, 6:] @ joints)
-        x = np.linalg.solve(kkt, np.concatenate([still, EPSILON * shared, -offset[:6]]))
+        x = np.linalg.solve(kkt, np.concatenate([still, self._epsilon * shared, -offset[:6]]))
         wrench = x[6:-6]
         return offset[6:] + mass[6:, :6] @ x[:6] - push[6:] @ wrench, wrench
 
@@ -258,10 +264,10 @@ class WholeBodyServo:
         kkt[range(6, nv), range(6, nv)] += step_s * self._damping
         kkt[:nv, nv:] = -push
         kkt[nv:, :nv] = -push.T
-        kkt[nv:, nv:] = -GIVE * np.eye(held)
+        kkt[nv:, nv:] = -self._give * np.eye(held)
         moved = self._data.M @ v - step_s * self._data.nle
         moved[6:] += step_s * (tau + self._damping * wish)
-        right = np.concatenate([moved, -GIVE * step_s * carried])
+        right = np.concatenate([moved, -self._give * step_s * carried])
         return np.linalg.solve(kkt, right)[6:nv]
 
     def _feet(self, command: Command) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 from jumplab.control.body import WholeBody
 from jumplab.control.estimator import SURE
 from jumplab.robot import Robot
+from jumplab.robot.legs import size
 
 SETTLED_S = 0.15  # after touchdown; before, the soles turn flat and the impact is not over
 # the capture point this far beyond the soles, for so long
@@ -47,7 +48,16 @@ class RecoveryStep:
 
     def __init__(self, robot: Robot, usable: tuple[float, float], force_noise_n: float = 0.0):
         foot = robot.foot
-        self._met_n = max(MET_N, SURE * force_noise_n)
+        large = size(robot)
+        self._met_n = max(large.of(MET_N, "N"), SURE * force_noise_n)
+        self._lift_m, self._beside_m, self._beyond_m = (
+            large.of(x, "m") for x in (LIFT_M, BESIDE_M, BEYOND_M)
+        )
+        self._reach_m = np.transpose([large.of(np.array(x), "m") for x in (FORWARD_M, ASIDE_M)])
+        self._swing_s, self._least_s, self._settled_s, self._beyond_s = (
+            large.of(x, "s") for x in (SWING_S, LEAST_S, SETTLED_S, BEYOND_S)
+        )
+        self._sink = large.of(SINK, "m/s")
         self.side: int | None = None
         self.began_s: float | None = None
         self._half = np.array([(foot.toe - foot.heel) / 2, foot.half_width]) * usable
@@ -61,23 +71,27 @@ class RecoveryStep:
         """
         if self.began_s is None and self._needed(time, body, foot_force):
             self.began_s = time
-            self.side = int(np.argmin([self._foothold(body, side, SWING_S)[1] for side in (0, 1)]))
+            self.side = int(
+                np.argmin([self._foothold(body, side, self._swing_s)[1] for side in (0, 1)])
+            )
         if self.side is None:
             return
         gone = time - self.began_s
-        if gone > SWING_S or (gone > SWING_S / 2 and foot_force[self.side] > self._met_n):
+        if gone > self._swing_s or (
+            gone > self._swing_s / 2 and foot_force[self.side] > self._met_n
+        ):
             self.side = None
-        elif gone < SWING_S - LEAST_S:
-            self.goal = self._foothold(body, self.side, SWING_S - gone)[0]
+        elif gone < self._swing_s - self._least_s:
+            self.goal = self._foothold(body, self.side, self._swing_s - gone)[0]
 
     def _needed(self, time: float, body: WholeBody, foot_force: np.ndarray) -> bool:
         beyond = False
-        if time > SETTLED_S and (foot_force > 0).any():
+        if time > self._settled_s and (foot_force > 0).any():
             turned = self._corners @ body.attitudes[:, :2, :2].transpose(0, 2, 1)
             corners = (body.soles[:, None, :2] + turned).reshape(-1, 2)
-            beyond = beyond_hull(_capture_point(body), corners) > BEYOND_M
+            beyond = beyond_hull(_capture_point(body), corners) > self._beyond_m
         self._beyond_since = min(self._beyond_since, time) if beyond else np.inf
-        return time - self._beyond_since >= BEYOND_S
+        return time - self._beyond_since >= self._beyond_s
 
     def _foothold(self, body: WholeBody, side: int, left_s: float) -> tuple[np.ndarray, float]:
         """Place (3,) of the sole of ``side`` that catches the robot in ``left_s``, and how far it
@@ -86,8 +100,8 @@ class RecoveryStep:
         axes, capture, pressure = self._over(body, 1 - side)
         out = np.array([1.0, 1.0 if side == 0 else -1.0])  # the foot's own side
         want = pressure + (capture - pressure) * np.exp(left_s / _pendulum_s(body, 1 - side))
-        want = out * want + [0.0, BESIDE_M]
-        there = np.clip(want, *np.transpose([FORWARD_M, ASIDE_M]))
+        want = out * want + [0.0, self._beside_m]
+        there = np.clip(want, *self._reach_m)
         stance = body.soles[1 - side]
         goal = np.append(stance[:2] + axes.T @ (out * there), stance[2])
         return goal, float(np.linalg.norm(np.maximum(np.abs(want - there) - self._half, 0.0)))
@@ -118,13 +132,13 @@ class RecoveryStep:
         place = body.soles[self.side]
         speed = body.twists[self.side][:3]
         gone = time - self.began_s
-        left = max(SWING_S - gone, LEAST_S)
-        half = SWING_S / 2 - gone
+        left = max(self._swing_s - gone, self._least_s)
+        half = self._swing_s / 2 - gone
         wish = 6 * (self.goal - place) / left**2 - 4 * speed / left
-        if half > LEAST_S / 2:
-            wish[2] = 6 * (self.goal[2] + LIFT_M - place[2]) / half**2 - 4 * speed[2] / half
+        if half > self._least_s / 2:
+            wish[2] = 6 * (self.goal[2] + self._lift_m - place[2]) / half**2 - 4 * speed[2] / half
         else:
-            wish[2] += 2 * SINK / left
+            wish[2] += 2 * self._sink / left
         return wish
 
 
@@ -136,7 +150,7 @@ def _capture_point(body: WholeBody) -> np.ndarray:
 
 def _pendulum_s(body: WholeBody, stance: int) -> float:
     """sqrt(z / g) of the CoM over a foot [s]."""
-    height = max(body.com[2] - body.soles[stance, 2], LEAST_HEIGHT_M)
+    height = max(body.com[2] - body.soles[stance, 2], body.size.of(LEAST_HEIGHT_M, "m"))
     return float(np.sqrt(height / -body.gravity[2]))
 
 

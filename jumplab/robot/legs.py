@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -14,8 +15,51 @@ from jumplab.robot.stance import stance_configuration
 if TYPE_CHECKING:
     from jumplab.robot.description import Robot
 
+# of the robot on which numbers in SI units were found: thigh and shank, and all of it
+LEG_M = 0.7
+MASS_KG = 42.0
+# kg, m and s of units
+UNITS = {
+    "m": (0, 1, 0),
+    "s": (0, 0, 1),
+    "m/s": (0, 1, -1),
+    "rad/s": (0, 0, -1),
+    "rad/s^2": (0, 0, -2),
+    "N": (1, 1, -2),
+    "N m": (1, 2, -2),
+    "N m s": (1, 2, -1),
+    "kg m^2": (1, 2, 0),
+}
 LOCAL = pin.ReferenceFrame.LOCAL
 BASE = 6  # columns of the base
+
+
+@dataclass(frozen=True)
+class Size:
+    """How many times as long and as heavy a robot is as the one on which numbers were found [1].
+
+    Under the same gravity, alike robots move alike if times grow by the root of the length
+    (Froude's law).
+    """
+
+    length: float
+    mass: float
+
+    def of(self, value: float | np.ndarray, unit: str) -> Any:
+        """A ``value`` that was found for the one robot, in one of :data:`UNITS`, for this one."""
+        kg, m, s = UNITS[unit]
+        return value * (self.mass**kg * self.length ** (m + s / 2))
+
+
+def size(robot: Robot) -> Size:
+    """The size of a ``robot``, by its mass, and by thigh and shank between the pitch axes."""
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, pin.neutral(robot.model))
+    roles = "hip_pitch", "knee", "ankle_pitch"
+    joints = [robot.model.getJointId(robot.joints[role][0]) for role in roles]
+    places = np.array([data.oMi[joint].translation[[0, 2]] for joint in joints])
+    leg_m = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+    return Size(float(leg_m) / LEG_M, robot.total_mass / MASS_KG)
 
 
 def leg_columns(robot: Robot) -> list[np.ndarray]:
