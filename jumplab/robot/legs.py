@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +29,17 @@ UNITS = {
     "N m": (1, 2, -2),
     "N m s": (1, 2, -1),
     "kg m^2": (1, 2, 0),
+    # of weights, over time
+    "1/s": (0, 0, -1),
+    "s^-2": (0, 0, -2),
+    "m^-2": (0, -2, 0),
+    "m^-2/s": (0, -2, -1),
+    "(m/s)^-2": (0, -2, 2),
+    "(m/s)^-2/s": (0, -2, 1),
+    "(rad/s^2)^-2/s": (0, 0, 3),
+    "(rad/s^3)^-2/s": (0, 0, 5),
+    "N^-2/s": (-2, -2, 3),
+    "(N m)^-2/s": (-2, -4, 3),
 }
 LOCAL = pin.ReferenceFrame.LOCAL
 BASE = 6  # columns of the base
@@ -49,6 +60,17 @@ class Size:
         """A ``value`` that was found for the one robot, in one of :data:`UNITS`, for this one."""
         kg, m, s = UNITS[unit]
         return value * (self.mass**kg * self.length ** (m + s / 2))
+
+    def scaled(self, settings: Any, units: Mapping[str, str]) -> Any:
+        """A dataclass of ``settings`` with the numbers, and tuples of them, that have ``units``
+        [name -> one of :data:`UNITS`] as they are for this robot.
+        """
+        moved = {}
+        for name, unit in units.items():
+            value = getattr(settings, name)
+            many = isinstance(value, tuple)
+            moved[name] = tuple(self.of(x, unit) for x in value) if many else self.of(value, unit)
+        return replace(settings, **moved)
 
 
 def size(robot: Robot) -> Size:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 from jumplab.errors import InputError, nearest, quoted, require_type
+from jumplab.robot.legs import Size
 from jumplab.ocp import Problem, Term, changed
 
 LAUNCH = ("flat", "toe")  # phases of "launch" in stages 1 and 3
@@ -147,12 +148,17 @@ def _stage_of(name: Any) -> tuple[str, str]:
 
 
 def settled(
-    kind: type[Settings], given: Settings | Mapping[str, Any] | None, flip: bool = False
+    kind: type[Settings],
+    given: Settings | Mapping[str, Any] | None,
+    flip: bool = False,
+    size: Size | None = None,
 ) -> Settings:
-    """Settings of a dataclass ``kind``: its defaults (of a flip, by ``of_flip``), and over them
-    what was ``given``, see :func:`named`.
+    """Settings of a dataclass ``kind``: its defaults (of a flip, by ``of_flip``; of a robot's
+    ``size``, by ``of_size``), and over them what was ``given``, see :func:`named`.
     """
     usual = kind().of_flip() if flip else kind()
+    if size is not None and hasattr(usual, "of_size"):
+        usual = usual.of_size(size)
     return replace(usual, **named(kind, given))
 
 

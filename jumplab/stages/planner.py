@@ -20,6 +20,7 @@ from jumplab.models.full import FullBody
 from jumplab.ocp import Problem, Term
 from jumplab.ocp.cache import in_turn
 from jumplab.robot import Robot
+from jumplab.robot.legs import size
 from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import configuration, stance_configuration
 from jumplab.stages.changes import LAST, StageChanges, named, settled, sorted_out
@@ -112,6 +113,7 @@ class Planner:
         self.keep = keep
         self.changes = sorted_out(terms, weights, off)
         self.atlas = atlas
+        self._size = size(robot)
         self._given = {Limits: limits, SrmpSettings: settings, Mesh: mesh}
         for kind in self._given:
             self._settings(kind, False)  # refuses what does not fit
@@ -125,7 +127,11 @@ class Planner:
     def _settings(self, kind: type, flip: bool) -> Any:
         """Limits, stage 1's settings or mesh, of jumps or of flips."""
         given = self._given[kind]
-        return given if kind is Mesh and isinstance(given, Mesh) else settled(kind, given, flip)
+        return (
+            given
+            if kind is Mesh and isinstance(given, Mesh)
+            else settled(kind, given, flip, self._size)
+        )
 
     @property
     def limits(self) -> Limits:
@@ -145,7 +151,7 @@ class Planner:
                 given = self.robot, self._settings(SrmpSettings, flip)
                 stage = SrmpPlanner(*given, keep=self.keep, changes=self.changes["srmp"])
             else:
-                weights = Weights().of_flip() if flip else Weights()
+                weights = settled(Weights, None, flip, self._size)
                 given = self._settings(Mesh, flip), self._settings(Limits, flip), weights
                 stage = self._whole_body(*given, tracking=name == LAST)
             self._stages[name, flip] = stage
@@ -426,9 +432,10 @@ class Planner:
         asked = sorted_out(weights=weights)[LAST]
         # a schedule has its own places; of a target only gravity and rise are taken
         level = JumpTask(0.0, rise_m, gravity=gravity)
-        settings = {"limits": self.limits}
+        costs = settled(Weights, None, size=self._size)
+        settings = {"limits": self.limits, "weights": costs}
         options = {}
-        if motion is not None:
+        if motion is not None:  # clips are of robots of one size, on which their numbers were found
             limits = replace(Limits().of_clip(), **named(Limits, self._given[Limits]))
             settings = {"limits": limits, "weights": Weights().of_clip(), "follows": True}
             options = {"begin": motion, "stance": stance, "starts": FOLLOWED}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jumplab.errors import InputError, quoted
+from jumplab.robot.legs import Size
 
 LATE_SHARE = 0.4  # of the flight, at its end: by then a flip has folded
 RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
@@ -100,6 +101,12 @@ class Limits:
             link_distance_m=0.008,  # its arms are near its legs for long, also between nodes
         )
 
+    def of_size(self, size: Size) -> Limits:
+        """Those of a robot of another ``size``, whose jumps they make alike; edges of platforms
+        are the world's, and how long a flight may last depends on gravity.
+        """
+        return size.scaled(self, LIMIT_UNITS)
+
     def of_flip(self) -> Limits:
         """The same for a jump that turns over: time to wind up, a trunk that arrives turning,
         caught by momentum.
@@ -156,6 +163,10 @@ class Weights:
         """The same for a motion that follows another one: what it costs counts less."""
         return replace(self, acceleration=2e-4, jerk=3e-7, torque=5e-5)
 
+    def of_size(self, size: Size) -> Weights:
+        """Those of a robot of another ``size``: each term has the same share of the cost."""
+        return size.scaled(self, WEIGHT_UNITS)
+
     def of_flip(self) -> Weights:
         """The same for a jump that turns over: stage 1's inertia, of a rod that turns as one, is
         only a hint.
@@ -168,6 +179,42 @@ class Weights:
             track_flight_inertia_rate=0.454,
             track_momentum=45.4,
         )
+
+
+# of the numbers that grow with the robot
+LIMIT_UNITS = dict.fromkeys(
+    (
+        *("cop_margin_m", "clearance_m", "body_clearance_m", "shank_clearance_m"),
+        *("ankle_margin_m", "capture_offset_m", "capture_window_m", "side_margin_m"),
+        *("torsion_arm_m", "hands_inward_m", "link_distance_m"),
+    ),
+    "m",
+)
+LIMIT_UNITS |= dict.fromkeys(("flat_s", "toe_s", "capture_slope_s"), "s")
+LIMIT_UNITS |= {
+    name: "rad/s" for name in vars(Limits()) if name.startswith("touchdown_") and "_rate" in name
+}
+LIMIT_UNITS |= {"touchdown_turning": "rad/s", "momentum_slack": "N m s"}
+WEIGHT_UNITS = {
+    "acceleration": "(rad/s^2)^-2/s",
+    "jerk": "(rad/s^3)^-2/s",
+    "torque": "(N m)^-2/s",
+    "force": "N^-2/s",
+    "mirror": "1/s",
+    "track_velocity": "(m/s)^-2/s",
+    "track_inertia": "1/s",
+    "track_inertia_rate": "s",
+    "track_flight_inertia_rate": "s",
+    "track_momentum": "s",
+    "heel_velocity": "(m/s)^-2/s",
+    "ankle_rate": "s",
+    "track_duration": "s^-2",
+    "follow_joints": "1/s",
+    "follow_base": "m^-2/s",
+    "follow_attitude": "1/s",
+    "follow_takeoff": "(m/s)^-2",
+    "follow_foothold": "m^-2",
+}
 
 
 @dataclass(frozen=True)
