@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 from jumplab.errors import InputError, nearest, quoted, require_type
-from jumplab.robot.legs import Size
 from jumplab.ocp import Problem, Term, changed
+from jumplab.robot.legs import Size
 
 LAUNCH = ("flat", "toe")  # phases of "launch" in stages 1 and 3
 PHASES = {  # stage -> names of its phases; but for stage 2 "launch" means both of LAUNCH
