@@ -21,6 +21,7 @@ from test_audit_amounts import JOINTS, random_tape
 from test_cli import one_sentence
 from test_export_amounts import short
 
+import jumplab as jl
 from jumplab.auditing import AuditReport, audit
 from jumplab.cli import main as command_line
 from jumplab.cli.common import values_of
@@ -108,6 +109,21 @@ def test_a_robot_of_another_size(size):
         np.testing.assert_allclose(getattr(other.sagittal, name), expected, rtol=1e-8, atol=1e-12, err_msg=name)
     np.testing.assert_allclose(stance_angles(other), stance_angles(one), atol=1e-8)
     assert other.foot.toe == pytest.approx(size * one.foot.toe) and other.total_mass == pytest.approx(42.0 * size**3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [0.42, 1.5])
+def test_small_and_large_robots_jump_alike(size):
+    """Of 3 and of 142 kg, with the same settings: the same jump in the robot's own lengths, times and forces."""
+    slow = math.sqrt(size)
+    robot, task = grown_robot(size).with_limits(speed=1 / slow), JumpTask(0.6 * size, 0.3 * size)
+    plan, usual = (jl.plan(*x) for x in ((task, robot), (JumpTask(0.6, 0.3), ROBOT)))
+    assert audit(plan.tape, robot, task).passed
+    assert plan.tape.t[-1] / slow == pytest.approx(usual.tape.t[-1], rel=0.01)
+    assert np.abs(plan.tape.tau).max() / size**4 == pytest.approx(np.abs(usual.tape.tau).max(), rel=0.02)
+    run = jl.simulate(plan, engine="mujoco")
+    assert run.landed, run.reason
+    assert run.metrics.foot_distance_m == pytest.approx(task.distance_m, abs=0.01 * size)
 
 
 # tape -----------------------------------------------------------------------------------------------------------
