@@ -28,17 +28,22 @@ LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
 
 
 def plan_or_advise(
-    planner: Planner, task: JumpTask, method: str = USUAL, patience_s: float = math.inf
+    planner: Planner,
+    task: JumpTask,
+    method: str = USUAL,
+    patience_s: float = math.inf,
+    starts: int = 1,
 ) -> JumpPlan:
-    """The plan of a target, as :meth:`jumplab.Planner.plan` (by ``method``); a refusal ends with an
-    easier target that has a plan.
+    """The plan of a target, as :meth:`jumplab.Planner.plan` (by ``method``, of the cheapest of
+    ``starts``); a refusal ends with an easier target that has a plan.
 
     Planning ends after ``patience_s`` of processor time [s]. Looking for another target takes some
     seconds more, so studies of many targets leave it out.
     """
     with patience(patience_s):
         try:
-            return planner.plan(task, method)
+            more = {} if starts == 1 else {"starts": starts}
+            return planner.plan(task, method, **more)
         except (InfeasibleError, SolverError) as e:
             refusal = e
             spent = left_s() <= 0
@@ -114,8 +119,14 @@ def _easier(task: JumpTask, refusal: JumplabError, tried: int) -> JumpTask | Non
     """An easier target than one that got this ``refusal``, the number ``tried``; None if there is
     none.
     """
-    least = getattr(refusal, "bound", None)  # distance that its platform takes
-    changes = _milder(task, tried) if least is None else {"distance_m": _milder_m(BEYOND, least)}
+    bound = getattr(refusal, "bound", None)
+    if bound is None:
+        changes = _milder(task, tried)
+    else:  # the least distance that its platform takes, or the most that any motion reaches
+        x = getattr(task, refusal.number)
+        beyond = abs(x) > bound
+        factor = math.copysign(MILDER if beyond else BEYOND, x)
+        changes = {refusal.number: _milder_m(factor, bound)}
     try:
         easier = replace(task, **changes)
     except InputError:  # beyond what a target can be

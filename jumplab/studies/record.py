@@ -25,7 +25,7 @@ from jumplab.robot import Robot
 from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Limits
+from jumplab.stages.whole_body import Limits, bounds
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.coordinates import even, in_plane, whole
 from jumplab.stages.whole_body.problem import SOUGHT
@@ -55,6 +55,7 @@ PLATFORM_ROOM_M = 0.1  # of a platform's distance, over the least that it takes
 BINDS = 1e-2  # [m, m/s, rad] that the whole of a limit is worth at least, to be named
 BINDING_SHARE = 0.05  # of its largest multiplier: from there to there it binds
 ACTIVE = 1e-3  # [m, m/s, rad] that a limit at a node is worth at least, to be one that binds
+LOOSE = 3.0  # times a record, from where on a bound says nothing
 MOST = 8  # limits of joints that are priced
 MOVED = 0.005  # share by which torques, speeds, masses and legs are moved
 RANGE_RAD = math.radians(0.5)
@@ -150,6 +151,8 @@ class Record(Shown):
     Attributes
     ----------
     what, value : the field of :class:`.JumpTask`, and how large it is at least [m, rad].
+    bound : what no motion exceeds, the rest of the target as in ``plan`` (of a distance, its rise
+        too) [m]; inf where none is known. See :func:`.bounds.most`.
     plan, audit : a plan at the record, and its audit.
     found : by the easy jump that each start was, the number in which it ended; nan for none.
     limits : what ends it, the dearest first.
@@ -158,6 +161,7 @@ class Record(Shown):
 
     what: str
     value: float
+    bound: float
     plan: JumpPlan
     audit: AuditReport
     found: Mapping[str, float]
@@ -193,10 +197,19 @@ class Record(Shown):
             stepped = f" (at {self.best:.3f}, from where a clean plan steps back; prices too)"
         played = f", lands at {self.share:.0%} of it in {' and '.join(landed) or 'no engine'}"
         return (
-            f"{self.plan.robot.name}: {word} at least {self.value:.3f} {self.unit} "
+            f"{self.plan.robot.name}: {word} at least {self.value:.3f} {self.unit}{self._at_most} "
             f"({self.alike} of {len(self.found)} starts within 1 %), ends by "
             f"{', '.join(ends)}{stepped}{played * bool(self.runs)}"
         )
+
+    @property
+    def _at_most(self) -> str:
+        """The bound in words, if it says something."""
+        if self.bound > LOOSE * self.value:
+            return f" and no bound below {LOOSE:g} times that is known"
+        rise = self.plan.task.height_m
+        by = "" if self.what == "height_m" else f" by any motion with its rise of {rise:.3f} m"
+        return f" and at most {self.bound:.2f} {self.unit}{by}"
 
     def prices(self, most: int = MOST) -> Prices:
         """What more of the ``most`` dearest limits of joints would buy, and of friction, mass and
@@ -251,8 +264,10 @@ def record(
         share, reserve, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
+    bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
     report = audit_plan(plan)
-    return Record(what, value, plan, report, found, ends, share, reserve, runs, program, solved)
+    made = plan, report, found, ends, share, reserve, runs
+    return Record(what, value, bound, *made, program, solved)
 
 
 class _Search:
