@@ -119,7 +119,7 @@ def test_the_command_prints_the_record_and_its_prices(highest, prices, monkeypat
         asked.update(robot=robot, what=what, given=given, share=share)
         return highest
 
-    monkeypatch.setattr(study, "_priced", lambda *_: prices)
+    monkeypatch.setattr(study, "priced", lambda *_: prices)
     monkeypatch.setattr(study, "record", known)
     out = tmp_path / "high"
     assert main(["record", "bhr", "height_m", "--distance-m", "0.1", "--prices", "--out", str(out)]) == 0
@@ -129,3 +129,42 @@ def test_the_command_prints_the_record_and_its_prices(highest, prices, monkeypat
     assert main(["record", "bhr", "height_m", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["record"]
     assert found["value"] == highest.value and found["limits"][0]["limit"] == "upper stop"
+
+
+def test_a_record_stands_below_its_bound(highest):
+    assert highest.value < highest.bound and "no bound below 3 times" in highest.line()
+    known = dataclasses.replace(highest, bound=1.2)
+    assert "at least 0.961 m and at most 1.20 m" in known.line()
+
+
+def test_a_few_priced_steps_lead_to_a_robot_that_jumps_higher(highest, bhr):
+    better = highest.improve({"gear": ["knee"], "thigh_m": (0.34, 0.36)}, budget=2)
+    assert better.after.value > 1.04 * highest.value and better.after.audit.passed
+    rows = {x.number: x for x in better.changes}
+    assert 0.8 < rows["gear of knee"].after < 0.9 and rows["thigh"].after == pytest.approx(0.36)
+    assert rows["thigh"].ends and not rows["gear of knee"].ends and all(x.buys > 0 for x in better.changes)
+    # to first order the prices add up to what it buys
+    bought = sum(x.buys for x in better.changes)
+    assert bought == pytest.approx(better.after.value - highest.value, rel=0.3)
+    knee = better.robot.actuators["left_knee"]
+    ratio = rows["gear of knee"].after
+    assert knee["effort"] == pytest.approx(ratio * bhr.actuators["left_knee"]["effort"])
+    assert knee["speed"] == pytest.approx(bhr.actuators["left_knee"]["speed"] / ratio)
+    assert "gear of knee 1 -> 0." in better.line() and "thigh 0.35 -> 0.36 m (at its end)" in better.line()
+    assert "gear of knee" in better._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("free", "sentence"),
+    [
+        ({}, "give what may change as a mapping, of gear, thigh_m, shank_m, mass_kg"),
+        ({"gear": ["elbow"]}, "'elbow', which is none of the roles"),
+        ({"gear": {"knee": (2, 1)}}, "the ends of gear of knee must be positive and in order"),
+        ({"gear": 3}, "give joints or roles"),
+        ({"thigh_m": (1, 2)}, "thigh is 0.35, outside of its ends 1 ... 2"),
+        ({"mass_kg": {"hat": (1, 2)}}, "there is no link 'hat'"),
+    ],
+)
+def test_what_is_no_number_of_the_robot_is_refused(highest, free, sentence):
+    with pytest.raises(InputError, match=sentence):
+        highest.improve(free)

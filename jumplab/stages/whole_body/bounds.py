@@ -28,7 +28,7 @@ def most(body: Body, limits: Limits, task: JumpTask, what: str) -> float:
     """The largest ``what`` ("height_m", "distance_m", "platform_m" or "side_m") of a target [m]
     that any motion could reach, the rest of it as in ``task``; inf where there is no bound.
     """
-    reach, start = _reach_and_start(body)
+    reach, start = reach_and_start(body)
     if what in WAYS:
         return _travel(body, limits, task, WAYS[what])
     if what == "height_m":
@@ -54,8 +54,8 @@ def refuse_impossible(body: Body, limits: Limits, task: JumpTask) -> None:
         if x > bound + ROUNDING_M:
             rise = "" if number == "height_m" else f" with a rise of {task.height_m:g} m"
             raise InfeasibleError(
-                f"a {word} of {x:g} m{rise} is impossible for robot {body.robot.name}: no motion of "
-                f"it exceeds {bound:.2f} m, by its reach and power, friction {limits.friction:g} "
+                f"a {word} of {x:g} m{rise} is impossible for robot {body.robot.name}: none of its "
+                f"motions exceeds {bound:.2f} m, by reach and power, friction {limits.friction:g} "
                 f"and a push of at most {push_s(limits):.3g} s",
                 number=number,
                 bound=bound,
@@ -69,7 +69,7 @@ def push_s(limits: Limits) -> float:
 
 def _travel(body: Body, limits: Limits, task: JumpTask, along: np.ndarray) -> float:
     """The most by which the soles could come ``along`` (2,), a unit vector seen from above [m]."""
-    reach, start = _reach_and_start(body)
+    reach, start = reach_and_start(body)
     g = task.gravity
     friction = limits.friction
     edges = np.linspace(0.0, reach, CELLS + 1)
@@ -96,7 +96,7 @@ def _power(body: Body, limits: Limits) -> float:
     return float(limits.torque_share * (motors.range(rate)[1] * rate).sum())
 
 
-def _reach_and_start(body: Body) -> tuple[float, np.ndarray]:
+def reach_and_start(body: Body) -> tuple[float, np.ndarray]:
     """How far the CoM can be from the toes' edges at most [m], and where it waits (3,) as seen from
     there [m]; each link counts from its own foot, those between the legs from both.
     """

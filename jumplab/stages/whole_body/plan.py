@@ -68,7 +68,7 @@ class WholeBodyPlan(Shown):
 
     @property
     def manner(self) -> dict[str, float]:
-        """How it jumps, by the fields of :class:`.Attempt`: what plans of several starts differ in."""
+        """How it jumps, by fields of :class:`.Attempt`, in which plans of several starts differ."""
         body = self.schedule.body
         q = self.tape.q[: self.tape.takeoff_index or None]
         swings = [np.ptp(q[:, 1 + column]) for column, _ in body.shoulders]

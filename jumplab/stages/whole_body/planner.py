@@ -222,7 +222,9 @@ class WholeBodyPlanner:
                     attempts.append(Attempt(start.name, start.hessian, e.iterations, 0.0, e.status))
                     continue
                 plans.append(body)
-                attempts += [*body.attempts[:-1], replace(body.attempts[-1], **body.manner)]
+                *first, last = body.attempts
+                name = start.name + f", {last.start}" * bool(first)
+                attempts += [*first, replace(last, start=name, **body.manner)]
         if not plans:
             return self.plan(task, **options)
         best = min(plans, key=lambda x: (x.used > 1, x.solution.statistics.objective))
