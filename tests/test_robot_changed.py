@@ -195,7 +195,6 @@ NOWHERE = "nor can it with knees at 0.3 ... 1.2 and the trunk at 0 ... 0.3 rad i
 NOWHERE += "soles"
 REFUSED = [
     ("with_gears", {"ratios": {"knee": 0}}, "the factor on the gear of 'knee' must be a positive number, got 0"),
-    ("with_gears", {"ratios": {"kne": 2}}, "the gears name 'kne', which is none of the roles hip, knee, ankle, "),
     ("with_gears", {"ratios": 2}, "the gears must be a mapping from joints or roles, got 2"),
     ("with_legs", {"thigh": "a"}, "the factor on the thighs must be a positive number, got 'a'"),
     ("with_legs", {"factor": -1}, "the factor on the legs must be a positive number, got -1"),

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.arguments import real
 from jumplab.errors import InputError, RobotError, Shown, SolverError, quoted
@@ -236,12 +237,10 @@ def _ends(word: str, ends: Any) -> tuple[float, float]:
 def _length(robot: Robot, here: str, there: str) -> float:
     """From a joint of the left leg to the next [m]."""
     model = robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
     first, last = (model.getJointId(robot.joints[role][0]) for role in (here, there))
-    way = model.jointPlacements[last].translation
-    while model.parents[last] != first:
-        last = model.parents[last]
-        way = model.jointPlacements[last].act(way)
-    return float(np.linalg.norm(way))
+    return float(np.linalg.norm(data.oMi[last].translation - data.oMi[first].translation))
 
 
 def _mass(robot: Robot, link: Any) -> float:

@@ -156,8 +156,8 @@ class Record(Shown):
         return priced(self, most)
 
     def again(self, robot: Robot) -> Record:
-        """The same record of another robot."""
-        return record(robot, self.what, **self.asked)
+        """The same record of another robot, without playing it."""
+        return record(robot, self.what, **{**self.asked, "engines": ()})
 
     def improve(self, free: Mapping[str, Any], budget: int = 6) -> Improved:
         """The robot within the ends of what is ``free`` whose record is larger, by priced steps.
