@@ -72,8 +72,9 @@ def plan(
     Raises
     ------
     InputError, InfeasibleError, SolverError
-        If a stage refuses the target or finds no motion; the sentence says which, and ends with an
-        easier target that has a plan, if one was found.
+        If a stage refuses the target or finds no motion; the sentence says which, names a record
+        that was sought and is near, and ends with an easier target that has a plan, if one was
+        found. "Impossible" is a target beyond what any motion reaches (notebook 15).
     """
     from jumplab.studies.advice import plan_or_advise
 
