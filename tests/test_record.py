@@ -178,6 +178,7 @@ def test_a_few_priced_steps_lead_to_a_robot_that_jumps_higher(highest, better, b
         ({"gear": 3}, "give joints or roles"),
         ({"thigh_m": (1, 2)}, "thigh is 0.35, outside of its ends 1 ... 2"),
         ({"mass_kg": {"hat": (1, 2)}}, "there is no link 'hat'"),
+        ("gear", "free must be a mapping"),
     ],
 )
 def test_what_is_no_number_of_the_robot_is_refused(highest, free, sentence):

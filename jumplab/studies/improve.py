@@ -113,7 +113,7 @@ def improve(record: Record, free: Mapping[str, Any], budget: int = 6) -> Improve
     """See :meth:`.Record.improve`."""
     numbers = _numbers(record.plan.robot, free)
     if not 0 < budget <= MOST_STEPS:
-        raise InputError(f"budget = {budget} records: give 1 to {MOST_STEPS}")
+        raise InputError(f"budget = {budget} records must be 1 to {MOST_STEPS}")
     with unexplained():
         shares, buys = _climbed(record, numbers, budget)
     robot = _changed(record.plan.robot, numbers, shares)

@@ -159,6 +159,7 @@ class Record(Shown):
         """The same record of another robot, without playing it."""
         return record(robot, self.what, **{**self.asked, "engines": ()})
 
+    @checked
     def improve(self, free: Mapping[str, Any], budget: int = 6) -> Improved:
         """The robot within the ends of what is ``free`` whose record is larger, by priced steps.
 
