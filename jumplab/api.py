@@ -42,6 +42,7 @@ def plan(
     method: str = USUAL,
     robust: Ranges | None = None,
     patience_s: float = math.inf,
+    starts: int = 1,
     **changes: Any,
 ) -> JumpPlan:
     """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz
@@ -63,14 +64,17 @@ def plan(
         see :mod:`jumplab.studies.robust`.
     patience_s : processor time after which planning of a target ends, with the best that was
         found or a refusal [s].
+    starts : how many starts are tried to the end, of which the cheapest plan counts; its
+        ``attempts`` say how the others differ. See :meth:`jumplab.Planner.plan`.
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and
         ``mesh``, as of :class:`jumplab.Planner`, which plans many targets with them.
 
     Raises
     ------
     InputError, InfeasibleError, SolverError
-        If a stage refuses the target or finds no motion; the sentence says which, and ends with an
-        easier target that has a plan, if one was found.
+        If a stage refuses the target or finds no motion; the sentence says which, names a record
+        that was sought and is near, and ends with an easier target that has a plan, if one was
+        found. "Impossible" is a target beyond what any motion reaches (notebook 15).
     """
     from jumplab.studies.advice import plan_or_advise
 
@@ -80,10 +84,11 @@ def plan(
             "give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)"
         )
     if contacts is not None or like is not None:
-        if robust is not None or method != USUAL or not (contacts is None or like is None):
+        alone = robust is None and method == USUAL and starts == 1
+        if not (alone and (contacts is None or like is None)):
             raise InputError(
                 "a contact schedule, or a jump like a clip, is planned by the whole-body program; "
-                "leave method and robust out, and give one of both"
+                "leave method, robust and starts out, and give one of both"
             )
         with patience(patience_s):
             return _followed(task, robot, contacts, like, changes)
@@ -91,7 +96,7 @@ def plan(
         from jumplab.studies.robust import robust_changes
 
         changes = robust_changes(task, robot, robust, changes)
-    return plan_or_advise(Planner(robot, keep=True, **changes), task, method, patience_s)
+    return plan_or_advise(Planner(robot, keep=True, **changes), task, method, patience_s, starts)
 
 
 def _followed(

@@ -136,9 +136,9 @@ def planner(bhr, monkeypatch):
     """A planner and an audit that answer at once; tests may change what they say."""
     said = types.SimpleNamespace(error=None, checks=[types.SimpleNamespace(name="slip", passed=True)], task=None)
 
-    def plan_jump(planner, task, method, patience_s):
+    def plan_jump(planner, task, method, patience_s, starts):
         robot = planner.robot
-        said.task, said.method, said.patience_s = task, method, patience_s
+        said.task, said.method, said.patience_s, said.starts = task, method, patience_s, starts
         if said.error:
             raise said.error
         return types.SimpleNamespace(

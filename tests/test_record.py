@@ -28,6 +28,11 @@ def prices(highest):
     return highest.prices(most=4)
 
 
+@pytest.fixture(scope="module")
+def better(highest):
+    return highest.improve({"gear": ["knee"], "thigh_m": (0.34, 0.36)}, budget=1)
+
+
 def test_a_constant_with_the_name_of_a_parameter_takes_its_place():
     """A run of one second from rest to rest, as far as a rate of 1 m/s and 8 m/s^2 allow."""
     far = Term("far", "ours", "m", "end", lambda p: 10.0 - p.p.goal, 1.0)
@@ -119,7 +124,7 @@ def test_the_command_prints_the_record_and_its_prices(highest, prices, monkeypat
         asked.update(robot=robot, what=what, given=given, share=share)
         return highest
 
-    monkeypatch.setattr(study, "_priced", lambda *_: prices)
+    monkeypatch.setattr(study, "priced", lambda *_: prices)
     monkeypatch.setattr(study, "record", known)
     out = tmp_path / "high"
     assert main(["record", "bhr", "height_m", "--distance-m", "0.1", "--prices", "--out", str(out)]) == 0
@@ -129,3 +134,53 @@ def test_the_command_prints_the_record_and_its_prices(highest, prices, monkeypat
     assert main(["record", "bhr", "height_m", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["record"]
     assert found["value"] == highest.value and found["limits"][0]["limit"] == "upper stop"
+    assert found["bound"] == highest.bound
+
+
+def test_the_command_improves_a_robot_and_saves_the_one_that_came_out(highest, better, monkeypatch, capsys, tmp_path):
+    asked = []
+    monkeypatch.setattr(study, "record", lambda *_, **options: highest)
+    monkeypatch.setattr(study.Record, "improve", lambda _, free: asked.append(free) or better)
+    out = tmp_path / "better"
+    assert main(["record", "bhr", "height_m", "--improve", "knee,hip", "--out", str(out)]) == 0
+    assert asked == [{"gear": ["knee", "hip"]}] and "gear of knee 1 -> 0.92" in capsys.readouterr().out
+    assert jl.load(out).plan.robot.hash == better.robot.hash
+
+
+def test_a_record_stands_below_its_bound(highest):
+    assert highest.value < highest.bound and "no bound below 3 times" in highest.line()
+    known = dataclasses.replace(highest, bound=1.2)
+    assert "at least 0.961 m and at most 1.20 m" in known.line()
+
+
+def test_a_few_priced_steps_lead_to_a_robot_that_jumps_higher(highest, better, bhr):
+    assert better.after.value > 1.04 * highest.value and better.after.audit.passed
+    rows = {x.number: x for x in better.changes}
+    assert rows["gear of knee"].after == pytest.approx(0.92) and rows["thigh"].after == pytest.approx(0.36)
+    assert rows["thigh"].ends and not rows["gear of knee"].ends and all(x.buys > 0 for x in better.changes)
+    # to first order the prices add up to what it buys
+    bought = sum(x.buys for x in better.changes)
+    assert bought == pytest.approx(better.after.value - highest.value, rel=0.2)
+    knee = better.robot.actuators["left_knee"]
+    ratio = rows["gear of knee"].after
+    assert knee["effort"] == pytest.approx(ratio * bhr.actuators["left_knee"]["effort"])
+    assert knee["speed"] == pytest.approx(bhr.actuators["left_knee"]["speed"] / ratio)
+    assert "gear of knee 1 -> 0." in better.line() and "thigh 0.35 -> 0.36 m (at its end)" in better.line()
+    assert "gear of knee" in better._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("free", "sentence"),
+    [
+        ({}, "give what may change as a mapping, of gear, thigh_m, shank_m, mass_kg"),
+        ({"gear": ["elbow"]}, "'elbow', which is none of the roles"),
+        ({"gear": {"knee": (2, 1)}}, "the ends of gear of knee must be positive and in order"),
+        ({"gear": 3}, "give joints or roles"),
+        ({"thigh_m": (1, 2)}, "thigh is 0.35, outside of its ends 1 ... 2"),
+        ({"mass_kg": {"hat": (1, 2)}}, "there is no link 'hat'"),
+        ("gear", "free must be a mapping"),
+    ],
+)
+def test_what_is_no_number_of_the_robot_is_refused(highest, free, sentence):
+    with pytest.raises(InputError, match=sentence):
+        highest.improve(free)

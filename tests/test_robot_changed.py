@@ -162,10 +162,41 @@ def test_published_robots_take_the_same_changes(name):
         robot.with_mass(f"{trunk}_rest", factor=2)
 
 
+def test_thighs_and_shanks_have_factors_of_their_own(bhr):
+    robot = bhr.with_legs(thigh=1.1, shank=0.9)
+    assert alike(robot, bhr.with_legs(thigh=1.1).with_legs(shank=0.9))
+    lengths = [
+        np.linalg.norm(robot.model.jointPlacements[robot.model.getJointId(f"left_{name}")].translation)
+        for name in ("knee", "ankle_pitch")
+    ]
+    np.testing.assert_allclose(lengths, [1.1 * 0.35, 0.9 * 0.35])
+    assert alike(bhr.with_legs(1.2), bhr.with_legs(thigh=1.2, shank=1.2))
+
+
+def test_gears_trade_torque_against_speed(bhr):
+    """Power stays, and what the motor itself takes grows: its inertia and damping with the square."""
+    taken = "[actuators]\narmature = {left_knee = 0.02}\ndamping = {left_knee = 0.3}"
+    config = bhr.config_text.replace("[actuators]", taken)
+    own = Robot.from_text(bhr.urdf, config)
+    robot = own.with_gears({"knee": 2.0, "right_knee": 0.5})
+    left, right = (robot.actuators[name] for name in ("left_knee", "right_knee"))
+    old = own.actuators["left_knee"]
+    assert (left["effort"], left["speed"]) == (2 * old["effort"], old["speed"] / 2)
+    assert left["effort"] * left["corner_speed"] == pytest.approx(old["effort"] * old["corner_speed"])
+    assert (right["effort"], right["speed"]) == (old["effort"] / 2, 2 * old["speed"])
+    assert (left["armature"], left["damping"], left["friction"]) == (0.08, 1.2, 0.0) and right["armature"] == 0.0
+    assert robot.model.armature[robot.model.idx_vs[robot.model.getJointId("left_knee")]] == 0.08
+    assert robot.hash != own.hash and bhr.with_gears({"knee": 1.0}).actuators == bhr.actuators
+    assert alike(Robot.from_text(robot.urdf, robot.config_text), robot)
+
+
 # refused --------------------------------------------------------------------------------------------------------
 NOWHERE = "nor can it with knees at 0.3 ... 1.2 and the trunk at 0 ... 0.3 rad in [stance]: correct its ranges or its "
 NOWHERE += "soles"
 REFUSED = [
+    ("with_gears", {"ratios": {"knee": 0}}, "the factor on the gear of 'knee' must be a positive number, got 0"),
+    ("with_gears", {"ratios": 2}, "the gears must be a mapping from joints or roles, got 2"),
+    ("with_legs", {"thigh": "a"}, "the factor on the thighs must be a positive number, got 'a'"),
     ("with_legs", {"factor": -1}, "the factor on the legs must be a positive number, got -1"),
     ("with_limits", {"effort": 0}, "the factor on effort must be a positive number, got 0"),
     ("with_limits", {"effort": np.nan}, "the factor on effort must be a positive number, got nan"),

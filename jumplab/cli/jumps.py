@@ -30,6 +30,7 @@ exports = Late("io.export")
 api = Late("api")
 auditing = Late("auditing")
 movies = Late("show.movies")
+tables = Late("show.tables")
 
 
 def run(args: Namespace) -> None:
@@ -71,7 +72,7 @@ def plan(args: Namespace) -> None:
     if args.contacts:
         why = "is part of a target, and --contacts gives a schedule instead"
         without(args, why, **{f.name: f.default for f in fields(JumpTask)[2:]})
-        without(args, why, distance_m=1.0, height_m=0.5, robust=False, atlas=None)
+        without(args, why, distance_m=1.0, height_m=0.5, robust=False, atlas=None, starts=1)
         task = None
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
@@ -87,6 +88,8 @@ def plan(args: Namespace) -> None:
     report = store.write_plan(args.out, *parts, complete=auditing.write_audit)
     args.found |= {"out": args.out, "plan": plan.summary, "audit": _audited(report)}
     print_summary(plan.summary)
+    if args.starts > 1:
+        print(tables.table([vars(x) for x in plan.attempts], digits=3))
     print(f"plan in {args.out}, whole run: {time.perf_counter() - start:.1f} s")
     judge(report, args.out)
 

@@ -262,6 +262,8 @@ def record(args: Namespace) -> None:
     options = given(studies.record.record, args, robot=robot, given=task)
     found = studies.record.record(**options)
     args.found["record"] = {"what": found.what, "value": found.value, "unit": found.unit}
+    if math.isfinite(found.bound):
+        args.found["record"]["bound"] = found.bound
     args.found["record"] |= {"found": found.found, "limits": [asdict(x) for x in found.limits]}
     args.found["record"]["landed"] = {name: run.landed for name, run in found.runs.items()}
     print(found.line())
@@ -275,6 +277,13 @@ def record(args: Namespace) -> None:
         args.found["prices"] = [asdict(row) for row in prices.rows]
         print(tables.table([asdict(row) | {"gap": row.gap} for row in prices.rows], digits=3))
         print(prices.line())
+    if args.improve:
+        better = found.improve({"gear": args.improve.split(",")})
+        args.found["improved"] = {"changes": [asdict(x) for x in better.changes]}
+        args.found["improved"]["value"] = better.after.value
+        print(better.line())
+        print(tables.table([asdict(x) for x in better.changes], digits=3))
+        found = better.after
     if args.out:
         api.save(args.out, found.plan)
         print(f"the plan at the record is in {args.out}")

@@ -10,6 +10,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
+import tomlkit
+
 from jumplab.arguments import real
 from jumplab.errors import InputError, nearest, quoted
 from jumplab.robot.files import LEG, ROLES
@@ -23,6 +25,7 @@ ATTRIBUTES = {"effort": "effort", "speed": "velocity", "lower": "lower", "upper"
 MOST = 1e9  # factor or number of a changed robot
 UNITS = {"effort": "N m", "speed": "rad/s", "lower": "rad", "upper": "rad"}
 ENDS = {"lower": "upper", "upper": "lower"}  # of a range, and the other one
+GEARED = {"armature": 2, "friction": 1, "damping": 2}  # powers of a gear's ratio that they go with
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -116,20 +119,41 @@ def masses(
     return _text(root), remarks
 
 
-def legs(robot: Robot, factor: float) -> tuple[str, list[str]]:
-    """The URDF with thighs and shanks ``factor`` [1] times as long, stretched from their joint
-    on to the next, and the remarks.
+def gears(robot: Robot, ratios: Mapping) -> str:
+    """The TOML with what the motors take of other gears: joint or role -> factor on the ratio [1].
+
+    Raises :class:`RobotError` as :meth:`.Robot.with_gears` says.
+    """
+    config = tomlkit.parse(robot.config_text)
+    for key, names in _joints(robot, ratios, "the gears"):
+        ratio = _number(robot, f"the factor on the gear of {key!r}", ratios[key], positive=True)
+        for name in names:
+            for what, power in GEARED.items():
+                if lost := robot.actuators[name][what]:
+                    rows = config["actuators"].setdefault(what, {})
+                    rows[name] = float(f"{lost * ratio**power:.12g}")
+    return tomlkit.dumps(config)
+
+
+def legs(robot: Robot, factor: float, thigh: float, shank: float) -> tuple[str, list[str]]:
+    """The URDF with thighs and shanks ``factor`` [1] times as long, each by its own besides,
+    stretched from their joint on to the next, and the remarks.
 
     Raises :class:`RobotError` as :meth:`.Robot.with_legs` says.
     """
-    factor = _number(robot, "the factor on the legs", factor, positive=True)
+    both = _number(robot, "the factor on the legs", factor, positive=True)
+    own = {"thighs": thigh, "shanks": shank}
+    factors = [
+        both * _number(robot, f"the factor on the {part}", x, positive=True)
+        for part, x in own.items()
+    ]
     root = _parsed(robot)
     remarks = []
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     links = {link.get("name"): link for link in root.findall("link")}
-    for name, end in [
-        pair
-        for here, there in pairwise(LEG)
+    for name, end, factor in [
+        (*pair, factor)
+        for (here, there), factor in zip(pairwise(LEG), factors, strict=True)
         for pair in zip(robot.joints[here], robot.joints[there], strict=True)
     ]:
         link = joints[name].find("child").get("link")

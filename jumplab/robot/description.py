@@ -311,14 +311,26 @@ class Robot(Shown):
         """
         return self._changed(*changes.masses(self, link, mass_kg, factor))
 
-    def with_legs(self, factor: float) -> Robot:
-        """Another robot, whose thighs and shanks are ``factor`` [1] times as long, and weigh the
-        same. The URDF gets the new numbers, the TOML a remark on each, so the :attr:`hash` is new.
-        Raises :class:`RobotError` for links that do not run along their own z from joint to joint,
-        as those of imported robots may not, for numbers that are no factor, and if the robot cannot
-        stand so.
+    def with_gears(self, ratios: Mapping[str, float]) -> Robot:
+        """Another robot, whose motors turn more often for a turn of their joints: by factors
+        ``ratios`` [1] of joints or roles ("knee"). Torques grow by the factor and speeds fall by
+        it, armature and damping grow with its square, dry friction with the factor.
+
+        Raises :class:`RobotError` for names that the robot lacks and for numbers that are no
+        factor.
         """
-        return self._changed(*changes.legs(self, factor))
+        geared = replace(self, config_text=changes.gears(self, ratios))
+        slower = {key: 1 / ratio for key, ratio in ratios.items()}
+        return geared.with_limits(effort=ratios, speed=slower)
+
+    def with_legs(self, factor: float = 1.0, *, thigh: float = 1.0, shank: float = 1.0) -> Robot:
+        """Another robot, whose thighs and shanks are ``factor`` [1] times as long, or each by a
+        factor of its own besides, and weigh the same. The URDF gets the new numbers, the TOML a
+        remark on each, so the :attr:`hash` is new. Raises :class:`RobotError` for links that do not
+        run along their own z from joint to joint, as those of imported robots may not, for numbers
+        that are no factor, and if the robot cannot stand so.
+        """
+        return self._changed(*changes.legs(self, factor, thigh, shank))
 
     def _changed(self, urdf: str, remarks: list[str]) -> Robot:
         """The robot of another URDF, with remarks in its TOML; itself without any."""

@@ -36,9 +36,11 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.auditing import AuditReport, ClipReport
     from jumplab.robot import Robot
     from jumplab.sim import SimulationResult
+    from jumplab.studies.improve import Improved
     from jumplab.studies.margins import MarginReport
     from jumplab.studies.mend import Mended
-    from jumplab.studies.record import Prices, Record
+    from jumplab.studies.prices import Prices
+    from jumplab.studies.record import Record
     from jumplab.studies.trials import TrialReport
 
 MOST_BINDING = 12  # limits of a record that are shown, the dearest
@@ -166,6 +168,13 @@ def _of_record(record: Record) -> Card:
     return table(rows, columns, digits=3), jump_strobe(record.plan.tape, record.plan.robot)
 
 
+def _of_improved(improved: Improved) -> Card:
+    columns = {"number": "number", "unit": "unit", "before": "was", "after": "becomes"}
+    columns |= {"low": "from", "high": "to", "buys": f"buys [{improved.after.unit}]"}
+    rows = table([vars(x) for x in improved.changes], columns, digits=3)
+    return rows, jump_strobe(improved.after.plan.tape, improved.robot)
+
+
 def _of_prices(prices: Prices) -> Card:
     rows = [vars(row) | {"gap": f"{row.gap:.1%}"} for row in prices.rows]
     columns = {"limit": "limit", "unit": "for one", "price": f"buys [{prices.unit}]"}
@@ -226,6 +235,7 @@ CARDS: Mapping[str, Callable[[Any], Card]] = {
     "Mended": _of_mended,
     "Record": _of_record,
     "Prices": _of_prices,
+    "Improved": _of_improved,
     "TrialReport": _of_trials,
     "MarginReport": _of_margins,
 }

@@ -37,10 +37,11 @@ from jumplab.stages.whole_body import (
     WholeBodyPlanner,
 )
 from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.bounds import refuse_impossible
 from jumplab.stages.whole_body.ground import surface_of_jump
 from jumplab.stages.whole_body.motions import Motion
 from jumplab.stages.whole_body.program import Program
-from jumplab.stages.whole_body.starts import FOLLOWED, GIVEN
+from jumplab.stages.whole_body.starts import COMPARED, FOLLOWED, GIVEN
 from jumplab.task import GRAVITY, JumpTask
 
 METHODS = ("three-step", "direct")
@@ -284,7 +285,10 @@ class Planner:
             raise InputError(
                 "a flip begins in the stance; leave its start away, or ask for no rotation"
             )
-        surface_of_jump(self._model, self._settings(Limits, bool(task.rotation_rad)), task)
+        limits = self._settings(Limits, bool(task.rotation_rad))
+        surface_of_jump(self._model, limits, task)
+        if start is None:  # elsewhere the CoM waits elsewhere
+            refuse_impossible(self._model, limits, task)
 
     # plans
     # ------------------------------------------------------------------------------------------
@@ -298,6 +302,7 @@ class Planner:
         weights: Mapping[str, float] | None = None,
         start: np.ndarray | None = None,
         near: JumpPlan | None = None,
+        starts: int = 1,
     ) -> JumpPlan:
         """Plan one jump.
 
@@ -312,6 +317,8 @@ class Planner:
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles
             flat; the stance if None. Not for flips, nor for robots that no plane describes.
         near : a plan by the same method for a target close by, to begin with; see :meth:`replan`.
+        starts : how many starts are tried to the end, 1 to 10, of which the cheapest counts; by
+            default the first that leads to a plan. Of the method "direct", jumps without rotation.
 
         Raises
         ------
@@ -321,6 +328,15 @@ class Planner:
         require_type(task, JumpTask, "the target")
         method = self.chosen(method, weights)
         self._check(task, method, start)
+        if not (starts == 1 or (1 < starts <= len(COMPARED) and near is None)):
+            raise InputError(
+                f"starts = {starts} must be 1 to {len(COMPARED)}, and 1 near another plan"
+            )
+        if starts > 1 and (method != "direct" or task.rotation_rad):
+            raise InputError(
+                "several starts are compared by the method 'direct', in jumps without rotation; "
+                "leave starts away"
+            )
         asked = self.prepared(method, weights, task)
         begin = {"weights": asked[LAST].weights}
         if start is not None:  # the middle of the soles is at the origin
@@ -329,7 +345,7 @@ class Planner:
         if near is not None:
             begin["near"] = near.whole_body
         if method == "direct":
-            body = self._direct(task, begin)
+            body = self._direct(task, begin, starts)
             return JumpPlan.of(self.robot, method, body)
         flip = bool(task.rotation_rad)
         last = self.stage(LAST, flip=flip)
@@ -359,11 +375,13 @@ class Planner:
             joints = None
         return JumpPlan.of(self.robot, method, body, srmp, joints, skipped=skipped)
 
-    def _direct(self, task: JumpTask, begin: Mapping[str, Any]) -> WholeBodyPlan:
+    def _direct(self, task: JumpTask, begin: Mapping[str, Any], starts: int) -> WholeBodyPlan:
         """The whole body alone; an atlas's plan close by first, where there is one."""
         flip = bool(task.rotation_rad)
         alone = not begin["weights"] and "near" not in begin
         last = self.stage("direct", flip=flip)
+        if starts > 1:
+            return last.cheapest(task, starts, **begin)
         if self.atlas is not None and alone and task.in_plane and not flip:
             if (body := self.atlas.solve(last, task, begin.get("stance"))) is not None:
                 return body

@@ -5,15 +5,18 @@ audited clean.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 from jumplab.auditing import audit_plan
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.io.progress import tell
+from jumplab.ocp.cache import remembered
 from jumplab.ocp.nlp import left_s, patience, unexplained
+from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
-from jumplab.task import JumpTask
+from jumplab.task import RANGES, JumpTask
 
 MILDER = 0.6  # of a number that was refused
 BEYOND = 1.4  # times the least distance that a platform takes
@@ -24,21 +27,27 @@ TRIES = 8
 LONGEST_S = 30.0
 AFTER_S = 3.0
 THREE_STEPS = ("SRMP", "joint_map")  # where a refusal is none of the method "direct"
+NEAR_RECORD = 0.85  # share of a record, from where on a refusal names it
 LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
 
 
 def plan_or_advise(
-    planner: Planner, task: JumpTask, method: str = USUAL, patience_s: float = math.inf
+    planner: Planner,
+    task: JumpTask,
+    method: str = USUAL,
+    patience_s: float = math.inf,
+    starts: int = 1,
 ) -> JumpPlan:
-    """The plan of a target, as :meth:`jumplab.Planner.plan` (by ``method``); a refusal ends with an
-    easier target that has a plan.
+    """The plan of a target, as :meth:`jumplab.Planner.plan` (by ``method``, of the cheapest of
+    ``starts``); a refusal ends with an easier target that has a plan.
 
     Planning ends after ``patience_s`` of processor time [s]. Looking for another target takes some
     seconds more, so studies of many targets leave it out.
     """
     with patience(patience_s):
         try:
-            return planner.plan(task, method)
+            more = {} if starts == 1 else {"starts": starts}
+            return planner.plan(task, method, **more)
         except (InfeasibleError, SolverError) as e:
             refusal = e
             spent = left_s() <= 0
@@ -62,7 +71,36 @@ def advised(
         advice = _advice(refusal, planner, task, method)
     if spent_s is not None:
         advice = f"planning was given up after {spent_s:g} s of processor time; {advice}"
-    return type(refusal)(f"{refusal}; {advice}", **vars(refusal))
+    said = "; ".join([str(refusal), *_records_near(planner.robot, task), advice])
+    return type(refusal)(said, **vars(refusal))
+
+
+def keep_record(robot: Robot, what: str, value: float) -> None:
+    """Keep a record of a robot [m, rad] within the usual limits, for refusals to come (see
+    :mod:`jumplab.ocp.cache`).
+    """
+    remembered(["record", what], robot.hash, lambda: value)
+
+
+def known_record(robot: Robot, what: str) -> float | None:
+    """The record that was kept [m, rad]; None without one."""
+    with suppress(LookupError):
+        return remembered(["record", what], robot.hash, lambda: {}["no record"])
+    return None
+
+
+def _records_near(robot: Robot, task: JumpTask) -> list[str]:
+    """Records of a robot that a target comes near to, or exceeds, in words."""
+    said = []
+    for what in ("height_m", "distance_m", "platform_m", "side_m", "yaw_rad"):
+        asked = abs(getattr(task, what))
+        record = known_record(robot, what) if asked else None
+        if record is not None and asked > NEAR_RECORD * record:
+            unit = "rad" if what == "yaw_rad" else "m"
+            said.append(
+                f"the record of {robot.name} is a {RANGES[what][0]} of at least {record:.3f} {unit}"
+            )
+    return said
 
 
 def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str) -> str:
@@ -114,8 +152,14 @@ def _easier(task: JumpTask, refusal: JumplabError, tried: int) -> JumpTask | Non
     """An easier target than one that got this ``refusal``, the number ``tried``; None if there is
     none.
     """
-    least = getattr(refusal, "bound", None)  # distance that its platform takes
-    changes = _milder(task, tried) if least is None else {"distance_m": _milder_m(BEYOND, least)}
+    bound = getattr(refusal, "bound", None)
+    if bound is None:
+        changes = _milder(task, tried)
+    else:  # the least distance that its platform takes, or the most that any motion reaches
+        x = getattr(task, refusal.number)
+        beyond = abs(x) > bound
+        factor = math.copysign(MILDER if beyond else BEYOND, x)
+        changes = {refusal.number: _milder_m(factor, bound)}
     try:
         easier = replace(task, **changes)
     except InputError:  # beyond what a target can be

@@ -11,13 +11,13 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.auditing import AuditReport, audit_plan
-from jumplab.errors import InfeasibleError, InputError, RobotError, Shown, SolverError, quoted
+from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
 from jumplab.ocp.problem import Phase
@@ -25,15 +25,18 @@ from jumplab.robot import Robot
 from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Limits
+from jumplab.stages.whole_body import Limits, bounds
 from jumplab.stages.whole_body.body import Body
-from jumplab.stages.whole_body.coordinates import even, in_plane, whole
 from jumplab.stages.whole_body.problem import SOUGHT
 from jumplab.stages.whole_body.program import Program, Solved
-from jumplab.stages.whole_body.starts import RECORD, SEEKING, Asked, from_solved
-from jumplab.stages.whole_body.terms import FAR, TORQUE_SPEED, WORTH
-from jumplab.stages.whole_body.terms import RECORD as RECORD_TERM
+from jumplab.stages.whole_body.starts import RECORD, SEEKING, Asked
+from jumplab.stages.whole_body.terms import TORQUE_SPEED, WORTH
+from jumplab.studies.advice import keep_record
+from jumplab.studies.prices import Prices, priced
 from jumplab.task import RANGES, JumpTask
+
+if TYPE_CHECKING:
+    from jumplab.studies.improve import Improved
 
 # easy jumps to begin with: (the number sought, rise), of the leg's length, or [rad]
 EASY = {
@@ -54,18 +57,8 @@ NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing
 PLATFORM_ROOM_M = 0.1  # of a platform's distance, over the least that it takes
 BINDS = 1e-2  # [m, m/s, rad] that the whole of a limit is worth at least, to be named
 BINDING_SHARE = 0.05  # of its largest multiplier: from there to there it binds
-ACTIVE = 1e-3  # [m, m/s, rad] that a limit at a node is worth at least, to be one that binds
+LOOSE = 3.0  # times a record, from where on a bound says nothing
 MOST = 8  # limits of joints that are priced
-MOVED = 0.005  # share by which torques, speeds, masses and legs are moved
-RANGE_RAD = math.radians(0.5)
-STOPS = {"upper stop": 1, "lower stop": -1}
-END = {1: "upper", -1: "lower"}
-MOTOR = {"torque": ("effort", "N m"), "speed": ("speed", "rad/s")}
-SEEN = 2e-5  # [m, rad] of a record, which solves find again
-WHOLE_UNITS = "deg", "0.01"
-MORE = 1.01  # times the worth of what is sought, in the second of two records that make prices
-FRICTION_STEP = 0.005
-KINDS = {"plane": in_plane, "even": even, "whole": whole}  # of coordinates
 
 
 @dataclass(frozen=True)
@@ -87,62 +80,6 @@ class Binding:
     worth: float
 
 
-@dataclass(frozen=True)
-class Price:
-    """What more of a limit buys.
-
-    Attributes
-    ----------
-    limit, unit : of what, for how much of it ("N m", "0.01").
-    price : of that unit by the multipliers, in the unit of the record.
-    checked : the same by a record with the limit moved by ``moved`` units; nan if none was found.
-    stays : whether the same limits bind then; where others do, a price holds for less.
-    """
-
-    limit: str
-    unit: str
-    price: float
-    checked: float
-    moved: float
-    stays: bool
-
-    @property
-    def gap(self) -> float:
-        """By how much the check differs from the price, as a share of it; of the least that is
-        seen where it is next to nothing.
-        """
-        return abs(self.checked - self.price) / max(abs(self.price), SEEN / self.moved)
-
-    @property
-    def step(self) -> float:
-        """One per cent of the limit, in its unit; of an angle and of friction the unit itself."""
-        return 1.0 if self.unit in WHOLE_UNITS else self.moved * 0.01 / MOVED
-
-    @property
-    def step_words(self) -> str:
-        """That in words."""
-        return self.unit if self.unit in WHOLE_UNITS else f"1 % ({self.step:.2g} {self.unit})"
-
-
-@dataclass(frozen=True, repr=False)
-class Prices(Shown):
-    """The prices of a record, dearest first."""
-
-    what: str
-    robot: str
-    unit: str
-    rows: tuple[Price, ...]
-
-    def line(self) -> str:
-        """How many there are, and how well they are confirmed."""
-        kept = [row.gap for row in self.rows if row.stays]
-        return (
-            f"{self.robot}, {self.what}: {len(self.rows)} prices; of {len(kept)} limits, which may "
-            f"be moved without others taking over, the checks differ by {max(kept, default=0):.1%} "
-            f"at most"
-        )
-
-
 @dataclass(frozen=True, repr=False)
 class Record(Shown):
     """The largest number of a target that was found for a robot.
@@ -150,14 +87,18 @@ class Record(Shown):
     Attributes
     ----------
     what, value : the field of :class:`.JumpTask`, and how large it is at least [m, rad].
+    bound : what no motion exceeds, the rest of the target as in ``plan`` (of a distance, its rise
+        too) [m]; inf where none is known. See :func:`.bounds.most`.
     plan, audit : a plan at the record, and its audit.
     found : by the easy jump that each start was, the number in which it ended; nan for none.
     limits : what ends it, the dearest first.
     share, reserve, runs : a plan at this share of the record, played in each engine.
+    asked : the rest of what was asked for, as arguments of :func:`record`.
     """
 
     what: str
     value: float
+    bound: float
     plan: JumpPlan
     audit: AuditReport
     found: Mapping[str, float]
@@ -167,6 +108,7 @@ class Record(Shown):
     runs: Mapping[str, SimulationResult]
     program: Program
     solved: Solved
+    asked: Mapping[str, Any]
 
     @property
     def unit(self) -> str:
@@ -193,16 +135,50 @@ class Record(Shown):
             stepped = f" (at {self.best:.3f}, from where a clean plan steps back; prices too)"
         played = f", lands at {self.share:.0%} of it in {' and '.join(landed) or 'no engine'}"
         return (
-            f"{self.plan.robot.name}: {word} at least {self.value:.3f} {self.unit} "
+            f"{self.plan.robot.name}: {word} at least {self.value:.3f} {self.unit}{self._at_most} "
             f"({self.alike} of {len(self.found)} starts within 1 %), ends by "
             f"{', '.join(ends)}{stepped}{played * bool(self.runs)}"
         )
+
+    @property
+    def _at_most(self) -> str:
+        """The bound in words, if it says something."""
+        if self.bound > LOOSE * self.value:
+            return f" and no bound below {LOOSE:g} times that is known"
+        rise = self.plan.task.height_m
+        by = "" if self.what == "height_m" else f" by any motion with its rise of {rise:.3f} m"
+        return f" and at most {self.bound:.2f} {self.unit}{by}"
 
     def prices(self, most: int = MOST) -> Prices:
         """What more of the ``most`` dearest limits of joints would buy, and of friction, mass and
         legs [m or rad per unit]; each checked by a record with it moved (a second or two).
         """
-        return _priced(self, most)
+        return priced(self, most)
+
+    def again(self, robot: Robot) -> Record:
+        """The same record of another robot, without playing it."""
+        return record(robot, self.what, **{**self.asked, "engines": ()})
+
+    @checked
+    def improve(self, free: Mapping[str, Any], budget: int = 6) -> Improved:
+        """The robot within the ends of what is ``free`` whose record is larger, by priced steps.
+
+        Parameters
+        ----------
+        free : what may change: "gear", a list of joints or roles (the ratio against what it is from
+            0.5 to 2) or a mapping from them to (low, high); "thigh_m" and "shank_m", (low, high)
+            [m]; "mass_kg", (low, high) of the robot, or a mapping from links, or tuples of links
+            that change alike, to (low, high) of each [kg].
+        budget : how many records may be sought on the way [1 to 40], a second or two each.
+
+        Raises
+        ------
+        InputError
+            For what is no number of the robot, or not between its ends now.
+        """
+        from jumplab.studies.improve import improve
+
+        return improve(self, free, budget)
 
 
 @checked
@@ -251,8 +227,13 @@ def record(
         share, reserve, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
+    bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
     report = audit_plan(plan)
-    return Record(what, value, plan, report, found, ends, share, reserve, runs, program, solved)
+    if given is None and not changes:
+        keep_record(robot, what, value)
+    made = plan, report, found, ends, share, reserve, runs
+    asked = {"given": given, "share": share, "engines": engines, **changes}
+    return Record(what, value, bound, *made, program, solved, asked)
 
 
 class _Search:
@@ -454,119 +435,3 @@ def _limit(
     name = phase.states[column - 3 * count]
     _, of, joint = name.partition("torque of ")
     return ("torque", joint) if of else None
-
-
-# prices
-# ----------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class _Move:
-    """A limit that is moved: who then jumps, within what, by how many units."""
-
-    limit: str
-    unit: str
-    moved: float
-    robot: Robot
-    limits: Limits
-
-
-def _moves(record: Record, most: int) -> Iterator[_Move]:
-    """The limits that bind, and what each record depends on: friction, mass, legs."""
-    robot = record.program.robot
-    limits = record.program.limits
-    motors = robot.actuators
-    kinds = {"torque": ("torque",), "speed": ("speed",), TORQUE_SPEED: ("torque", "speed")}
-    pairs = {}
-    for row in record.limits:
-        for kind in kinds.get(row.limit, (row.limit,)):
-            if row.joint in motors:
-                pairs.setdefault((kind, row.joint))
-    for kind, joint in list(pairs)[:most]:
-        signs = _both(record.program, joint)
-        word = f"{_role(robot, joint)} {kind}"
-        if kind in STOPS:
-            way = STOPS[kind]
-            ranges = {
-                name: {END[way * sign]: motors[name][END[way * sign]] + way * sign * RANGE_RAD}
-                for name, sign in signs.items()
-            }
-            wider = robot.with_limits(joints=ranges)
-            yield _Move(word, "deg", math.degrees(RANGE_RAD), wider, limits)
-        else:
-            what, unit = MOTOR[kind]
-            stronger = robot.with_limits(**{what: dict.fromkeys(signs, 1 + MOVED)})
-            yield _Move(word, unit, MOVED * motors[joint][what], stronger, limits)
-    more = replace(limits, friction=limits.friction + FRICTION_STEP)
-    yield _Move("friction", "0.01", FRICTION_STEP / 0.01, robot, more)
-    heavier = robot.with_mass(factor=1 + MOVED)
-    yield _Move("mass, everywhere", "kg", MOVED * robot.total_mass, heavier, limits)
-    with suppress(RobotError):  # legs that nobody can stretch
-        longer = robot.with_legs(1 + MOVED)
-        leg_m = record.program.body.leg_m
-        yield _Move("thighs and shanks", "cm", 100 * MOVED * leg_m, longer, limits)
-
-
-def _both(program: Program, joint: str) -> dict[str, int]:
-    """A joint and the one on the other side, which an even motion moves alike, with its sign."""
-    names = program.body.model.names
-    column = program.free.spread[:, program.free.free_names.index(joint)]
-    return {names[k]: int(np.sign(column[k])) for k in np.flatnonzero(column)}
-
-
-def _role(robot: Robot, joint: str) -> str:
-    roles = {name: role for role, pair in robot.joints.items() for name in pair}
-    word = roles.get(joint, joint).removeprefix("left_").removeprefix("right_")
-    return word.replace("_", " ")
-
-
-def _priced(record: Record, most: int) -> Prices:
-    """The prices of a record.
-
-    Multipliers say what a limit is worth in the sum of record and effort; how that grows with the
-    worth of the record alone is what it buys. So two records of different worth make a price, with
-    the effort's part gone.
-    """
-    program = record.program
-    task = record.plan.task
-    usual = next(
-        t.weight for _, t in record.solved.solution.problem.terms() if t.name == RECORD_TERM
-    )
-    first = Asked(task), record.solved
-    other = Asked(task, weights={RECORD_TERM: MORE * usual})
-    second = other, program.solve(other, RECORD, from_solved(program, record.solved))
-    reached = _reached(program, record.solved)
-    # of the cost by what is sought, which is nearly a straight line; a rise goes with the square
-    slope = -(MORE - 1) * WORTH * (1 - reached / FAR)
-    by = reached / task.gravity if program.sought[0] == "takeoff_speed" else 1.0
-    costs = [program.cost_of(*x) for x in (first, second)]
-    active = _active(program, task, record.solved)
-    rows = []
-    for move in _moves(record, most):
-        tell(f"price of {move.limit}")
-        body = Body(move.robot)
-        free = KINDS[program.free.kind](body)
-        moved = replace(program, body=body, limits=move.limits, free=free, keep=False)
-        saved = [moved.cost_of(*x) - cost for x, cost in zip((first, second), costs, strict=True)]
-        price = by * (saved[1] - saved[0]) / slope / move.moved
-        checked = math.nan
-        stays = False
-        with suppress(SolverError):
-            solved = moved.solve(first[0], RECORD, from_solved(moved, record.solved))
-            checked = by * (_reached(moved, solved) - reached) / move.moved
-            stays = _active(moved, task, solved) == active
-        rows.append(Price(move.limit, move.unit, price, checked, move.moved, stays))
-    rows.sort(key=lambda row: -abs(row.price * row.moved))
-    return Prices(record.what, record.plan.robot.name, record.unit, tuple(rows))
-
-
-def _active(program: Program, task: JumpTask, solved: Solved) -> set[tuple]:
-    """The limits that bind, node by node."""
-    return {
-        (name, column, int(k))
-        for name, column, _, lam, limit in program.limits_of(Asked(task), solved)
-        for k in np.flatnonzero(np.abs(lam) * np.minimum(np.abs(limit), 1.0) > ACTIVE * WORTH)
-    }
-
-
-def _reached(program: Program, solved: Solved) -> float:
-    """What is sought, in the words of the program."""
-    return next(iter(solved.solution.phases.values())).constants[program.sought[0]]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,15 @@ from jumplab.io.files import open_log
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED
 from jumplab.show.tables import Table, table
+from jumplab.stages.whole_body import Limits
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.bounds import most
 from jumplab.studies.record import record
+from jumplab.task import JumpTask
 
 LOG = Path(__file__).with_name("records.jsonl")
 WHAT = ("height_m", "distance_m")
+BOUNDED = ("distance_m", "side_m", "platform_m", "height_m")
 BINDING = 3  # limits that a row names
 COLUMNS = {
     "robot": "robot",
@@ -31,6 +36,7 @@ COLUMNS = {
     "standing": "apex against standing [m]",
     "played_high": "lands at",
     "farthest": "distance [m]",
+    "bound": "no motion with its rise farther than [m]",
     "played_far": "lands at ",
     "ends": "the rise ends by",
 }
@@ -47,6 +53,7 @@ def row(name: str, what: str) -> dict[str, Any]:
         ends = dict.fromkeys(f"{x.joint.replace('_', ' ')} {x.limit}".strip() for x in best.limits)
         found |= {
             "value": round(best.value, 4),
+            "bound": round(best.bound, 4),
             "rise_m": round(best.plan.planned_rise_m, 4),
             "apex_m": round(best.plan.planned_apex_m, 4),
             "starts": {word: x if x == x else None for word, x in best.found.items()},
@@ -88,10 +95,21 @@ def records_table() -> Table:
         high, far = (found.get(what, {}) for what in WHAT)
         line = {"robot": name, "ends": ", ".join(high.get("ends", ()))}
         line |= {"highest": high.get("value"), "standing": high.get("apex_m"), "farthest": far.get("value")}
+        line["bound"] = far.get("bound")
         for key, x in (("played_high", high), ("played_far", far)):
             line[key] = f"{x['share']:.0%}" if x.get("landed") and all(x["landed"].values()) else None
         out.append(line)
     return table(out, COLUMNS, digits=3)
+
+
+def bounds_table(robot: Robot, rises_m: Sequence[float]) -> Table:
+    """What no motion of a robot exceeds, a row a rise."""
+    body = Body(robot)
+    rows = []
+    for rise in rises_m:
+        task = JumpTask(0.0, rise)
+        rows.append({"rise [m]": rise} | {what: most(body, Limits(), task, what) for what in BOUNDED})
+    return table(rows, digits=3)
 
 
 def main() -> None:

@@ -158,6 +158,9 @@ def in_plane(body: Body) -> Coordinates:
     return _mirrored(body, "plane", moving | set(body.joint_names) - legs)
 
 
+KINDS = {"whole": whole, "even": even, "plane": in_plane}
+
+
 def _mirrored(body: Body, kind: str, moving: set[str]) -> Coordinates:
     """Even motions of the ``moving`` joints; the others stay as in the stance, which they have to
     contain.

@@ -75,10 +75,13 @@ class Motion:
         return np.concatenate([[0.0], np.cumsum(self.durations)])
 
 
-def along(schedule: Schedule, task: JumpTask) -> Motion:
+def along(schedule: Schedule, task: JumpTask, crouch: float = CROUCH, arms: float = 1.0) -> Motion:
     """A motion along the schedule, per phase charts (N + 1, 6 + joints): the base above feet that
     carry, down before and after a flight, a parabola in it; feet on their places, and between them
     on bumps; legs by inverse kinematics.
+
+    ``crouch`` is how far the base goes down before a flight, of the leg's length, and ``arms`` how
+    far arms swing, of :data:`ARMS` [1].
     """
     contacts = schedule.contacts
     body = schedule.body
@@ -86,7 +89,7 @@ def along(schedule: Schedule, task: JumpTask) -> Motion:
     if contacts.ends == "touchdown":
         durations[-1] = _flight_s(task, body.leg_m)
     motion = Motion(durations, [])
-    curves = _curves(schedule, task, motion.starts)
+    curves = _curves(schedule, task, motion.starts, crouch, arms)
     reach = Reach(body, schedule.limits.range_margin_rad)
     feet = Feet(schedule, task, motion.starts)
     missed = 0.0
@@ -126,11 +129,11 @@ def still(schedule: Schedule, task: JumpTask) -> Motion:
     return Motion(motion.durations, charts)
 
 
-def reached(schedule: Schedule, task: JumpTask) -> Motion:
-    """The motion :func:`along` the schedule if its feet are near their places (by less than
-    :data:`REACHED`), else the stance.
+def reached(schedule: Schedule, task: JumpTask, **drawn: float) -> Motion:
+    """The motion :func:`along` the schedule, as it is ``drawn``, if its feet are near their places
+    (by less than :data:`REACHED`), else the stance.
     """
-    motion = along(schedule, task)
+    motion = along(schedule, task, **drawn)
     return motion if motion.missed < REACHED else still(schedule, task)
 
 
@@ -199,9 +202,11 @@ def _flight_s(task: JumpTask, leg: float) -> float:
 
 
 def _curves(
-    schedule: Schedule, task: JumpTask, starts: np.ndarray
+    schedule: Schedule, task: JumpTask, starts: np.ndarray, crouch: float, swing: float
 ) -> Callable[[float], list[float]]:
-    """Time [s] -> x, y, z, yaw, roll, pitch of the base and swing of the arms."""
+    """Time [s] -> x, y, z, yaw, roll, pitch of the base and swing of the arms; ``crouch`` and
+    ``swing`` as of :func:`along`.
+    """
     from scipy.ndimage import gaussian_filter1d  # slow to import
 
     body = schedule.body
@@ -215,7 +220,7 @@ def _curves(
     height = body.stance[2] + up
     pitch = np.full_like(fine, body.stance[5])
     arms = np.zeros_like(fine)
-    crouch, left, middle, landed = ARMS
+    back, left, middle, landed = ARMS
     for k, p in enumerate(phases):
         if not p.flying:
             continue
@@ -224,13 +229,13 @@ def _curves(
         before = np.clip((fine - begin) / CROUCH_S + 1, 0, 1)
         after = np.clip((fine - end) / CROUCH_S, 0, 1)
         height += task.gravity * (end - begin) ** 2 / 2 * u * (1 - u)
-        height -= body.leg_m * CROUCH * np.sin(np.pi * before) * (before < 1)
+        height -= body.leg_m * crouch * np.sin(np.pi * before) * (before < 1)
         height -= body.leg_m * LANDED * np.minimum(2 * u, 1) * (1 - np.sin(np.pi * after / 2))
         pitch += (BOW - pitch[0]) * np.sin(np.pi * before)
         pitch += (PITCH - pitch[0]) * (u > 0) * (1 - after)
         times = begin - CROUCH_S, begin - 0.4 * CROUCH_S, begin, (begin + end) / 2, end
-        swings = [0.0, crouch, left, middle, landed, 0.0]
-        arms += np.interp(fine, [*times, end + CROUCH_S], swings)
+        swings = [0.0, back, left, middle, landed, 0.0]
+        arms += swing * np.interp(fine, [*times, end + CROUCH_S], swings)
     pitch += np.interp(fine, starts[-2:], [0.0, task.rotation_rad])
     curves = [x, y, height, yaw, np.full_like(fine, body.stance[4]), pitch, arms]
     return lambda t: [np.interp(t, fine, curve) for curve in curves]

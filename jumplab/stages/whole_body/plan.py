@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from jumplab.errors import Shown
 from jumplab.io.tape import Tape
 from jumplab.ocp.solution import PhaseSolution, Solution
@@ -63,6 +65,20 @@ class WholeBodyPlan(Shown):
             used_between(tape, robot, surface),
             start,
         )
+
+    @property
+    def manner(self) -> dict[str, float]:
+        """How it jumps, by fields of :class:`.Attempt`, in which plans of several starts differ."""
+        body = self.schedule.body
+        q = self.tape.q[: self.tape.takeoff_index or None]
+        swings = [np.ptp(q[:, 1 + column]) for column, _ in body.shoulders]
+        heels = [x.q[-1, -1] for name, x in self.solution.phases.items() if name == "toe"]
+        return {
+            "cost": self.solution.statistics.objective,
+            "crouch_m": float(q[0, 2] - q[:, 2].min()),
+            "arms_rad": float(max(swings, default=0.0)),
+            "heels_rad": float(max(heels, default=0.0)),
+        }
 
     @property
     def launch_s(self) -> float:

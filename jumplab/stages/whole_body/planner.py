@@ -13,7 +13,7 @@ import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.ocp.cache import in_turn
-from jumplab.ocp.nlp import EXPLAINED, Nlp, left_s
+from jumplab.ocp.nlp import EXPLAINED, Nlp, left_s, unexplained
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import Robot
 from jumplab.robot.stance import holding
@@ -29,6 +29,7 @@ from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.starts import (
     ASIDE,
     COLD,
+    COMPARED,
     FROM_NEIGHBOUR,
     GIVEN,
     IN_PLANE,
@@ -38,6 +39,7 @@ from jumplab.stages.whole_body.starts import (
     SETTLED,
     STANCE,
     Asked,
+    Attempt,
     Start,
 )
 from jumplab.task import JumpTask
@@ -204,6 +206,29 @@ class WholeBodyPlanner:
             f"best by a factor of {best.used:.3g}; ask for less, or for a finer mesh",
             stage=name,
         )
+
+    @in_turn
+    def cheapest(self, task: JumpTask, count: int, **options: Any) -> WholeBodyPlan:
+        """The plan of least cost from the first ``count`` of :data:`.COMPARED`, each tried to the
+        end; its attempts say how they differ. ``options`` and errors as of :meth:`plan`.
+        """
+        plans = []
+        attempts = []
+        with unexplained():
+            for start in COMPARED[:count]:
+                try:
+                    body = self.plan(task, starts=[start], **options)
+                except SolverError as e:
+                    attempts.append(Attempt(start.name, start.hessian, e.iterations, 0.0, e.status))
+                    continue
+                plans.append(body)
+                *first, last = body.attempts
+                name = start.name + f", {last.start}" * bool(first)
+                attempts += [*first, replace(last, start=name, **body.manner)]
+        if not plans:
+            return self.plan(task, **options)
+        best = min(plans, key=lambda x: (x.used > 1, x.solution.statistics.objective))
+        return replace(best, attempts=tuple(attempts))
 
     def solved(self, task: JumpTask) -> Solved:
         """The first motion that keeps every limit at the nodes (N + 1,), without a look between

@@ -24,7 +24,7 @@ from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.apart import merged, too_close
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES, Contacts
-from jumplab.stages.whole_body.coordinates import Coordinates
+from jumplab.stages.whole_body.coordinates import KINDS, Coordinates
 from jumplab.stages.whole_body.ground import Surface, surface_of_jump, surface_of_schedule
 from jumplab.stages.whole_body.motions import Motion
 from jumplab.stages.whole_body.problem import SOUGHT, Schedule
@@ -138,6 +138,12 @@ class Program(Shown):
             replace(p, intervals=math.ceil(FINER * p.intervals)) for p in self.contacts.phases
         )
         return replace(self, contacts=replace(self.contacts, phases=phases))
+
+    def like(self, robot: Robot) -> Program:
+        """The same for another robot with the same joints."""
+        body = Body(robot)
+        free = KINDS[self.free.kind](body)
+        return replace(self, body=body, free=free, keep=False)
 
     @property
     def size(self) -> int:

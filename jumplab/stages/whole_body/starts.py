@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,13 +37,25 @@ class Beginning:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of one start."""
+    """What came of one start; of those that are compared also their plans (None of others).
+
+    Attributes
+    ----------
+    cost : of the program [1].
+    crouch_m : how far the base went down before take-off.
+    arms_rad : range of the shoulders until then, 0 without arms.
+    heels_rad : pitch of the feet as they left the ground.
+    """
 
     start: str
     hessian: str
     iterations: int
     cpu_s: float
     status: str
+    cost: float | None = None
+    crouch_m: float | None = None
+    arms_rad: float | None = None
+    heels_rad: float | None = None
 
 
 @dataclass(frozen=True)
@@ -105,10 +118,10 @@ class Start:
         return "held Gauss-Newton" if self.held else "exact"
 
 
-def from_schedule(program: Program, asked: Asked) -> Beginning:
-    """A motion drawn along the schedule (see :func:`.along`)."""
+def from_schedule(program: Program, asked: Asked, **drawn: float) -> Beginning:
+    """A motion ``drawn`` along the schedule (see :func:`.along`)."""
     schedule = program.schedule()
-    return Beginning(guess(schedule, reached(schedule, asked.task)))
+    return Beginning(guess(schedule, reached(schedule, asked.task, **drawn)))
 
 
 def from_stance(program: Program, asked: Asked) -> Beginning:
@@ -177,6 +190,23 @@ COLD = (
     Start("schedule", from_schedule, True, 150),
     Start("schedule", from_schedule, False, 150),
     Start(STANCE, from_stance, False, 80),
+)
+# those that are compared, where the cheapest of several is asked for
+COMPARED = (
+    *COLD[1:],
+    *(
+        Start(name, partial(from_schedule, crouch=crouch, arms=arms), False, 150)
+        for name, crouch, arms in (
+            ("deep", 0.35, 1.0),
+            ("shallow", 0.05, 1.0),
+            ("arms still", 0.2, 0.0),
+            ("arms wide", 0.2, 2.0),
+            ("arms the other way", 0.2, -1.0),
+            ("deep, arms wide", 0.35, 2.0),
+            ("shallow, arms still", 0.05, 0.0),
+            ("shallow, arms the other way", 0.05, -1.0),
+        )
+    ),
 )
 ASIDE = (Start("ramp", from_straight, True, 150), *COLD)
 # in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is
