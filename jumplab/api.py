@@ -5,6 +5,7 @@ them all.
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -66,6 +67,9 @@ def plan(
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and
         ``mesh``, as of :class:`jumplab.Planner`, which plans many targets with them.
 
+    A plan that fails its audit, or lands too fast to be caught, is returned with a warning that
+    says so, as its ``audit`` and its card do.
+
     Raises
     ------
     InputError, InfeasibleError, SolverError
@@ -86,12 +90,16 @@ def plan(
                 "leave method and robust out, and give one of both"
             )
         with patience(patience_s):
-            return _followed(task, robot, contacts, like, changes)
-    if robust is not None:
-        from jumplab.studies.robust import robust_changes
+            made = _followed(task, robot, contacts, like, changes)
+    else:
+        if robust is not None:
+            from jumplab.studies.robust import robust_changes
 
-        changes = robust_changes(task, robot, robust, changes)
-    return plan_or_advise(Planner(robot, keep=True, **changes), task, method, patience_s)
+            changes = robust_changes(task, robot, robust, changes)
+        made = plan_or_advise(Planner(robot, keep=True, **changes), task, method, patience_s)
+    if not made.audit.sound:
+        warnings.warn(f"the plan is returned with its faults: {made.verdict}", stacklevel=3)
+    return made
 
 
 def _followed(
@@ -114,11 +122,9 @@ def _followed(
 @checked
 def audit(plan: JumpPlan) -> AuditReport:
     """Check a plan by a second code path that sees its tape, its robot and its target, and nothing
-    of the planner.
+    of the planner: :attr:`jumplab.JumpPlan.audit`, made once.
     """
-    from jumplab.auditing import audit_plan
-
-    return audit_plan(plan)
+    return plan.audit
 
 
 @checked
@@ -189,7 +195,9 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
     from jumplab.sim import Scene, simulate_jump
 
     options.setdefault("scene", Scene.of_plan(plan.summary, plan.robot))
-    return simulate_jump(plan.tape, plan.robot, **options)
+    run = simulate_jump(plan.tape, plan.robot, **options)
+    plan.landings.append(run.landed)
+    return run
 
 
 @checked
@@ -199,7 +207,8 @@ def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None
     """
     from jumplab.auditing import write_audit
 
-    report = folders.write_plan(folder, plan.tape, plan.robot, plan.summary, complete=write_audit)
+    told = {**plan.summary, "audit": plan.audit.line()}
+    report = folders.write_plan(folder, plan.tape, plan.robot, told, complete=write_audit)
     if run is not None:
         folders.write_simulation(folder, run, folders.read_plan(folder)[2])
     return report
@@ -214,7 +223,10 @@ def load(folder: str | Path) -> Saved:
 
     tape, robot, summary = folders.read_plan(folder)
     plan = JumpPlan.on_file(tape, robot, summary)
-    return Saved(plan, SimulationResult.load(folder, robot))
+    run = SimulationResult.load(folder, robot)
+    if run is not None:
+        plan.landings.append(run.landed)
+    return Saved(plan, run)
 
 
 @checked

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jumplab.arguments import checked
-from jumplab.auditing import AuditReport, audit_plan
+from jumplab.auditing import AuditReport
 from jumplab.errors import InfeasibleError, InputError, RobotError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
@@ -251,7 +251,7 @@ def record(
         share, reserve, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
-    report = audit_plan(plan)
+    report = plan.audit
     return Record(what, value, plan, report, found, ends, share, reserve, runs, program, solved)
 
 
@@ -351,9 +351,9 @@ class _Search:
                 failed = str(e)
                 continue
             plan = JumpPlan.of(robot, "direct", body)
-            if (report := audit_plan(plan)).passed:
+            if plan.audit.passed:
                 break
-            failed = ", ".join(check.name for check in report.failed)
+            failed = ", ".join(check.name for check in plan.audit.failed)
         else:
             raise SolverError(
                 f"robot {robot.name}: {self.what} reaches {getattr(self.task, self.what):.3f} at "
