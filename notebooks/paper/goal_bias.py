@@ -198,7 +198,7 @@ def corrected(goal: JumpTask, planner: Planner, different: Perturbation) -> dict
 
 
 def told(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """How many robots land at once, the median and worst of their miss [mm], how many hit the goal, in how many jumps."""
+    """How many robots land at once, median and worst of their miss [mm], how many hit the goal, in how many jumps."""
     first = [abs(row["missed_mm"][0]) for row in rows if row["landed"][0]]
     hit = [row["jumps"] for row in rows if row["hit"]]
     return {
