@@ -48,6 +48,9 @@ def plan(
     """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz
     tape.
 
+    A plan that fails its audit, or lands too fast to be caught, is returned with a warning that
+    says so, as its ``audit`` and its card do.
+
     Parameters
     ----------
     task : what to reach, in a jump from a stand; or else
@@ -66,9 +69,6 @@ def plan(
         found or a refusal [s].
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and
         ``mesh``, as of :class:`jumplab.Planner`, which plans many targets with them.
-
-    A plan that fails its audit, or lands too fast to be caught, is returned with a warning that
-    says so, as its ``audit`` and its card do.
 
     Raises
     ------
@@ -134,6 +134,9 @@ def judge(
     """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
     fall, forces from nowhere, motors, joints, collisions.
 
+    Returns a report, of several clips a list. Raises :class:`InputError` for what holds no clip of
+    the robot.
+
     Parameters
     ----------
     motion : a plan or a simulation; or the path of a clip (pickles of motion libraries and
@@ -143,9 +146,6 @@ def judge(
         clip with more joints than it moves, the shipped robot of the same URDF that has those.
     reading : ``fps`` [1/s] of files that do not say, ``order`` of joints without names
         ("depth-first" or "breadth-first").
-
-    Returns a report, of several clips a list. Raises :class:`InputError` for what holds no clip of
-    the robot.
     """
     from jumplab.auditing.clip import judge as judged
 
