@@ -50,7 +50,7 @@ def front_page(app, exception):
 def sentences(app, what, name, obj, options, lines):
     """Of ``name : words`` in a list of parameters the words are no type, which is in the annotation: put them below."""
     inside, text = False, []
-    for above, line in zip(["", *lines], lines):
+    for above, line in zip(["", *lines], lines, strict=False):
         if set(above.strip()) == {"-"}:
             inside = text[-2].strip() in ("Parameters", "Attributes")
         named = re.fullmatch(r"([\w*., `]+?) : (.+)", line)
