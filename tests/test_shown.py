@@ -56,6 +56,7 @@ def test_a_plan_keeps_its_audit_and_how_it_landed(plan, monkeypatch, tmp_path):
         jl.simulate(clean, engine=engine)
     assert clean.audit.passed and clean.verdict == "all 51 checks passed; not landed in 1 of 2 tries"
     assert clean.verdict in repr(clean) and clean.verdict in clean._repr_html_()
+    assert plan.landings == [] == replace(clean).landings  # each plan has its own
 
 
 def test_the_rise_counts_from_take_off_and_the_apex_from_the_stance(plan):

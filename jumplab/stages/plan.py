@@ -67,7 +67,7 @@ class JumpPlan(Shown, Named):
     joints: JointPlan | None = None
     whole_body: WholeBodyPlan | None = None
     contacts: Contacts | None = None
-    landings: list[bool] = field(default_factory=list, compare=False)
+    landings: list[bool] = field(default_factory=list, init=False, compare=False)
 
     @classmethod
     def of(
