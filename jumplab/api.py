@@ -5,6 +5,7 @@ them all.
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -47,6 +48,9 @@ def plan(
 ) -> JumpPlan:
     """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz
     tape.
+
+    A plan that fails its audit, or lands too fast to be caught, is returned with a warning that
+    says so, as its ``audit`` and its card do.
 
     Parameters
     ----------
@@ -91,12 +95,17 @@ def plan(
                 "leave method, robust and starts out, and give one of both"
             )
         with patience(patience_s):
-            return _followed(task, robot, contacts, like, changes)
-    if robust is not None:
-        from jumplab.studies.robust import robust_changes
+            made = _followed(task, robot, contacts, like, changes)
+    else:
+        if robust is not None:
+            from jumplab.studies.robust import robust_changes
 
-        changes = robust_changes(task, robot, robust, changes)
-    return plan_or_advise(Planner(robot, keep=True, **changes), task, method, patience_s, starts)
+            changes = robust_changes(task, robot, robust, changes)
+        planner = Planner(robot, keep=True, **changes)
+        made = plan_or_advise(planner, task, method, patience_s, starts)
+    if not made.audit.sound:
+        warnings.warn(f"the plan is returned with its faults: {made.verdict}", stacklevel=3)
+    return made
 
 
 def _followed(
@@ -119,11 +128,9 @@ def _followed(
 @checked
 def audit(plan: JumpPlan) -> AuditReport:
     """Check a plan by a second code path that sees its tape, its robot and its target, and nothing
-    of the planner.
+    of the planner: :attr:`jumplab.JumpPlan.audit`, made once.
     """
-    from jumplab.auditing import audit_plan
-
-    return audit_plan(plan)
+    return plan.audit
 
 
 @checked
@@ -132,6 +139,9 @@ def judge(
 ) -> ClipReport | list[ClipReport]:
     """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
     fall, forces from nowhere, motors, joints, collisions.
+
+    Returns a report, of several clips a list. Raises :class:`InputError` for what holds no clip of
+    the robot.
 
     Parameters
     ----------
@@ -142,9 +152,6 @@ def judge(
         clip with more joints than it moves, the shipped robot of the same URDF that has those.
     reading : ``fps`` [1/s] of files that do not say, ``order`` of joints without names
         ("depth-first" or "breadth-first").
-
-    Returns a report, of several clips a list. Raises :class:`InputError` for what holds no clip of
-    the robot.
     """
     from jumplab.auditing.clip import judge as judged
 
@@ -194,7 +201,9 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
     from jumplab.sim import Scene, simulate_jump
 
     options.setdefault("scene", Scene.of_plan(plan.summary, plan.robot))
-    return simulate_jump(plan.tape, plan.robot, **options)
+    run = simulate_jump(plan.tape, plan.robot, **options)
+    plan.landings.append(run.landed)
+    return run
 
 
 @checked
@@ -204,7 +213,8 @@ def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None
     """
     from jumplab.auditing import write_audit
 
-    report = folders.write_plan(folder, plan.tape, plan.robot, plan.summary, complete=write_audit)
+    told = {**plan.summary, "audit": plan.audit.line()}
+    report = folders.write_plan(folder, plan.tape, plan.robot, told, complete=write_audit)
     if run is not None:
         folders.write_simulation(folder, run, folders.read_plan(folder)[2])
     return report
@@ -219,7 +229,10 @@ def load(folder: str | Path) -> Saved:
 
     tape, robot, summary = folders.read_plan(folder)
     plan = JumpPlan.on_file(tape, robot, summary)
-    return Saved(plan, SimulationResult.load(folder, robot))
+    run = SimulationResult.load(folder, robot)
+    if run is not None:
+        plan.landings.append(run.landed)
+    return Saved(plan, run)
 
 
 @checked

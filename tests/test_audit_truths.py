@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +14,7 @@ import pytest
 from fixtures_audit import ROBOT, good_tape, with_forces
 
 from jumplab.auditing import audit, write_audit
-from jumplab.auditing.motion import foot_turn
+from jumplab.auditing.motion import capture, foot_turn
 from jumplab.auditing.replay import replay
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
@@ -53,6 +54,33 @@ def statue_and_top() -> Tape:
     blank = np.zeros((len(t), 2, 6))
     return with_forces(Tape(t, q, v, a, np.zeros((len(t), model.nv - 6)), phase, np.array(ROBOT.foot.frames), blank,
                             np.array(ROBOT.joint_names)))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("velocity", "spin", "rests"),
+    [
+        ((0.0, 0.0, -3.0), 0.0, 0.1 * 3.0 / 0.5),  # ahead of the soles' middle, so the impact throws it forward
+        ((0.6, 0.0, 0.0), 0.0, 0.6),
+        ((0.6, 0.0, 0.0), -40 * 0.6 * 0.5, 0.0),  # the angular momentum takes it back
+        ((-1.0, 0.0, 0.0), 0.0, -1.0),
+    ],
+)
+def test_the_capture_point_by_hand(velocity, spin, rests):
+    """A CoM 0.5 m over soles of 0.2 m and 0.1 m ahead of their middle, gravity 9.8, 40 kg."""
+    corners = np.array([[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
+    r = SimpleNamespace(is_jump=True, sole_points=corners[None, None], com=np.array([[0.1, 0.0, 0.5]]), mass=40.0,
+                        momentum=np.array([[0.0, spin, 0.0]]), com_velocity=np.array([velocity]), gravity=9.8,
+                        tape=SimpleNamespace(t=np.array([1.0])))  # fmt: skip
+    ((name, share, when),) = capture(r)
+    place = 0.1 + rests * math.sqrt(0.5 / 9.8)
+    assert (name, when.tolist()) == ("capture point", [1.0])
+    assert share == pytest.approx(max(0.0, abs(place) - 0.1) / 0.5)
+    r.is_jump = False
+    assert list(capture(r)) == []
+
+
+def test_a_jump_that_lands_can_be_caught(good):
+    assert audit(good, ROBOT, JumpTask(1.0, 0.5)).sound
 
 
 def link_places(angles) -> list:

@@ -85,13 +85,22 @@ def test_table_and_json_word_for_word():
     assert said.pop("checks")[1] == {
         "group": "one", "name": "longer", "value": 3.0, "limit": 2.0, "unit": "mm", "time": None, "note": "second",
         "at_least": False, "passed": False}  # fmt: skip
-    assert said == {"schema": "jumplab-passport-1", "passed": False, "failed": ["longer", "b"], "manifest": {}}
+    assert said == {"schema": "jumplab-passport-1", "passed": False, "failed": ["longer", "b"], "manifest": {},
+                    "capture": None}  # fmt: skip
     odd = AuditReport((Check("a", "x", math.nan, 9.0, "m", 0.1, "what"),), {"size": np.float64(np.inf)})
     strict = json.loads(odd.to_json(), parse_constant=pytest.fail)
     assert strict["checks"][0]["value"] is None and strict["manifest"]["size"] is None and not strict["passed"]
     assert not AuditReport(()).passed
     with pytest.raises(KeyError):
         found["absent"]
+    fast = AuditReport(checks[:1], {}, LIMITS["capture point"].check(0.7))
+    words = (
+        "but it lands too fast to be caught: the capture point lies 70 % of the CoM's height outside the "
+        "soles, at most 40 were caught; ask for less distance or rise"
+    )
+    assert fast.passed and not fast.sound and fast.line() == f"all 1 checks passed; {words}"
+    assert fast.table().endswith(f"\n{words}") and json.loads(fast.to_json())["capture"]["value"] == 70
+    assert AuditReport(checks[:1], {}, LIMITS["capture point"].check(0.3)).sound and not found.sound
 
 
 def test_the_notes_carry_what_was_found():

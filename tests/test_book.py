@@ -18,7 +18,7 @@ from test_show_page import CHROMIUM, browser
 from test_show_page_controls import GRAPHICS, PATIENCE_MS, SIZES
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[browser]'")
-BUILDERS = ("furo", "myst_nb", "sphinx")
+BUILDERS = ("furo", "mathjax", "myst_nb", "sphinx")
 installed = all(map(importlib.util.find_spec, BUILDERS))
 pytestmark = [
     pytest.mark.slow,
@@ -27,15 +27,27 @@ pytestmark = [
 ]
 ROOT = Path(__file__).resolve().parent.parent
 BUILT_S = 900  # generous: a machine that does much else besides
-# broken pictures, links, identifiers, and how far the body reaches to the right
+# broken pictures, links, formulas, and how far the body reaches to the right. A formula is wrong if it is an error, is
+# not drawn, or if its dots and tildes are not as many as its source has, each over one glyph
 LOOK = """async () => {
+  await globalThis.MathJax?.startup?.promise;
+  const wrong = [...document.querySelectorAll(".math")].filter((x) => !x.querySelector("mjx-container"));
+  for (const { math, typesetRoot } of globalThis.MathJax?.startup?.document?.math ?? []) {
+    const count = (names) => (math.match(new RegExp(`\\\\\\\\(${names})(?![a-zA-Z])`, "g")) ?? []).length;
+    const over = [...typesetRoot.querySelectorAll('[data-mml-node="mover"]')];
+    const letters = over.filter((x) => x.children[0].querySelectorAll("use, path").length === 1);
+    const small = "d{0,2}dot|tilde|hat|bar";
+    const right = over.length === count(`${small}|overline`) && letters.length >= count(small);
+    if (!right || typesetRoot.querySelector('[data-mml-node="merror"]')) wrong.push({ textContent: math });
+  }
+  const formulas = wrong.map((x) => x.textContent.slice(0, 80));
   const broken = [];
   for (const picture of document.images) {
     picture.loading = "eager";
     await picture.decode().catch(() => broken.push(picture.getAttribute("src").slice(0, 80)));
   }
   const links = [...document.links].map((a) => a.href);
-  return { broken, links, right: document.scrollingElement.scrollWidth };
+  return { broken, links, formulas, right: document.scrollingElement.scrollWidth };
 }"""
 
 
@@ -84,7 +96,7 @@ def test_first_page_leads_to_the_book(site):
     target = re.search(r'url=([^"]+)"', (site / "index.html").read_text(encoding="utf-8"))[1]
     assert (site / target).is_file()
     overview = (site / "00_overview.html").read_text(encoding="utf-8")
-    assert overview.count("<img") > 1 and "<iframe" in overview and "<math" in overview
+    assert overview.count("<img") > 1 and "<iframe" in overview and "tex-svg-full.js" in overview
     assert {"jump.html", "00_overview.html", "gallery.html", "api.html", "tuning.html"} <= {p.name for p in pages(site)}
 
 
@@ -97,6 +109,7 @@ def faults_of(tab, page: Path, site: Path, width: int) -> list[str]:
     tab.goto(page.as_uri() + ("#t=1.1" if page.name == "jump.html" else ""))
     seen = tab.evaluate(LOOK)
     said += [f"no picture {source}" for source in seen["broken"]]
+    said += [f"wrong formula {tex}" for tex in seen["formulas"]]
     said += filter(None, (dead(link, site) for link in sorted({*seen["links"]})))
     if seen["right"] > width:
         said.append(f"{seen['right']} pixels wide")

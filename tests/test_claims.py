@@ -10,8 +10,8 @@ import pinocchio as pin
 import pytest
 from fixtures_core import jump, planner
 from paper import claims, hard_cases
-from paper.claims import Start, against_crouch, compare_starts, judge, readings, readings_markdown
-from paper.tracking import launch_followed
+from paper.claims import CLAIMS, Start, against_crouch, compare_starts, judge, readings, readings_markdown
+from paper.tracking import launch_followed, tracking
 
 from jumplab.cli import notebooks
 from jumplab.errors import InputError
@@ -24,36 +24,79 @@ from jumplab.task import GRAVITY, JumpTask
 
 
 @pytest.mark.parametrize(
-    ("ok", "change", "verdict"),
+    ("name", "value", "change", "verdict"),
     [
-        (True, "", "holds"),
-        (np.bool_(True), "half of it", "holds with a change"),
-        (False, "", "does not hold"),
-        (False, "half of it", "does not hold"),
-        (None, "", "cannot be checked here"),
+        ("time", 2.0, "", "holds"),
+        ("time", np.float64(2), "half of it", "holds with a change"),
+        ("time", 10.1, "", "does not hold"),
+        ("time", 10.1, "half of it", "does not hold"),
+        ("time", np.nan, "", "does not hold"),
+        ("wrenches", 12, "half of it", "adopted: ours by construction"),
+        ("wrenches", 6, "", "does not hold"),
+        ("hardware", None, "", "open: cannot be checked here"),
     ],
 )
-def test_verdict_follows_the_measurement(ok, change, verdict):
-    row = judge("it jumps", ok, "1.0 m", "00_overview", change)
-    assert judge("it jumps", ok, "1.0 m", "00_overview", change, adopted=True)["verdict"] == (
-        "adopted: ours by construction" if ok else verdict
+def test_verdict_follows_the_measurement(name, value, change, verdict):
+    claim = CLAIMS[name]
+    row = judge(name, "1.0 m", dict.fromkeys(claim.limits or (), value), change)
+    assert row == {"claim": claim.sentence, "verdict": verdict, "holds if": claim.words, "measured": "1.0 m",
+                   "change": change, "where": claim.where}  # fmt: skip
+
+
+def test_limits_in_words():
+    assert CLAIMS["jumps"].words == ("toe to toe [m] ≥ 1; CoM up on the platform [m] 0.48 … 0.52; jumps that stand = 2")
+    assert CLAIMS["shapes"].words.startswith(
+        "least rho of that at lift-off ≤ 0.95; change by the legs [kg m²] ≤ -0.01;"
     )
-    assert row == {
-        "claim": "it jumps",
-        "verdict": verdict,
-        "measured": "1.0 m",
-        "change": change,
-        "where": "00_overview",
-    }
+    assert CLAIMS["hardware"].words == "none"
+
+
+# of each claim the values that just keep its limits, and one by one those that just do not
+EDGES = {
+    "jumps": [(1.0, 0.999), (0.48, 0.479), (2, 1)],
+    "time": [(10.0, 10.01)],
+    "chain": [(3, 2), (4, 5), (20, 19), (7, 8)],
+    "size": [(1.45, 1.449), (42.5, 42.51), (14, 13)],
+    "links": [(9, 8), (20, 19), (2, 1), (6, 5), (2, 1), (4, 3)],
+    "five links": [(1e-9, 1.01e-9)],
+    "wrenches": [(12, 11)],
+    "gravity": [(9.8, 9.79), (9.8, 9.81)],
+    "ballistics": [(0.03, 0.0301), (0.05, 0.0501)],
+    "sensors": [(1, 1.001), (250, 250.1), (8, 8.01)],
+    "open loop": [(1, 0), (0, 1), (1, 0), (0, 1)],
+    "differs": [(20, 19), (50, 50.1), (0.9, 0.89)],
+    "bias": [(20, 19), (0.9, 0.89)],
+    "guess": [(24, 23), (0.95, 0.951), (0.95, 0.951)],
+    "tracks": [(0.1, 0.101)],
+    "bows": [(3.0, 2.99), (3.0, 2.99)],
+    "shapes": [(0.95, 0.951), (-0.01, 0), (-0.01, 0), (0.01, 0)],
+    "vibrates": [(3, 2), (0, 1), (0.05, 0.0501)],
+    "flip": [(0.3, 0.301)],
+    "posture": [(20.0, 19.9), (0, 1), (0, 1)],
+}
+OTHER_ENDS = {"jumps": [(1, 0.521)], "size": [(0, 1.551), (1, 41.49)], "differs": [(1, 0.99)]}
+
+
+@pytest.mark.parametrize("name", [name for name, claim in CLAIMS.items() if claim.limits])
+def test_each_limit_decides(name):
+    """A value that just keeps all limits holds; with any one of them just beyond, the claim does not."""
+    names = list(CLAIMS[name].limits)
+    kept = [inside for inside, _ in EDGES[name]]
+    assert judge(name, "1", dict(zip(names, kept, strict=True)))["verdict"] != "does not hold"
+    beyond = [*enumerate(outside for _, outside in EDGES[name]), *OTHER_ENDS.get(name, ())]
+    for k, value in beyond:
+        values = dict(zip(names, [*kept[:k], value, *kept[k + 1 :]], strict=True))
+        assert judge(name, "1", values)["verdict"] == "does not hold", values
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("", True, "1 m", "x"), "claim of a claim must be a text, got ''"),
-        (("it jumps", True, " ", "x"), "measured of a claim must be a text, got ' '"),
-        (("it jumps", True, 1.0, "x"), "measured of a claim must be a text, got 1.0"),
-        (("it jumps", 1, "1 m", "x"), "verdict of a claim must be True, False or None, got 1"),
+        (("it jumps", "1 m"), "there is no claim 'it jumps'; choose of jumps, time, chain, size,"),
+        (("time", " ", {"slowest plan [CPU s]": 1}), "measured of a claim must be a text, got ' '"),
+        (("time", 1.0), "measured of a claim must be a text, got 1.0"),
+        (("time", "1 s"), "claim 'time': measured are no values; it needs slowest plan [CPU s] ≤ 10"),
+        (("time", "1 s", {"s": 1}), "claim 'time': measured are s; it needs slowest plan [CPU s] ≤ 10"),
     ],
 )
 def test_a_verdict_without_numbers_is_refused(arguments, sentence):
@@ -77,6 +120,17 @@ def test_five_links_are_nine(bhr):
     assert max(differ.values()) < 1e-9, differ
 
 
+def test_what_five_links_miss_is_told(bhr, monkeypatch):
+    def off(*given):
+        found = claims_planar(*given)
+        return found | {"com": found["com"] + [2e-3, -3e-3], "L": found["L"] - 0.5, "rho": found["rho"] + 0.25}
+
+    claims_planar = claims.planar_quantities
+    monkeypatch.setattr(claims, "planar_quantities", off)
+    differ = claims.five_against_nine(bhr, samples=3, seed=3)
+    assert [differ[k] for k in ("CoM [m]", "L [kg m^2/s]", "rho [kg m^2]")] == pytest.approx([3e-3, 0.5, 0.25])
+
+
 def test_starts_are_compared_with_the_crouch():
     """Medians of shares, worked out by hand; a target that the crouch fails does not count."""
     a, b, c = (JumpTask(x, 0.3) for x in (0.2, 0.4, 0.6))
@@ -92,6 +146,20 @@ def test_starts_are_compared_with_the_crouch():
     assert guess["stage 3 alone, share"] == pytest.approx(0.5)
     assert guess["with the guess, share"] == pytest.approx(0.875)
     assert against_crouch(rows[-2:])[1]["iterations, share"] is None
+
+
+def test_costlier_jumps_are_told():
+    """More than a hundredth above the least cost found for a target, from whatever start."""
+    tasks = [JumpTask(x, 0.3) for x in (0.2, 0.4, 0.6)]
+    costs = [(1.0, 1.009, 1.0), (1.011, 1.0, 1.2), (2.0, 2.5, 2.0)]
+    rows = [
+        Start(task, name, 10, 1.0, 1.0, cost)
+        for task, found in zip(tasks, costs, strict=True)
+        for name, cost in zip(claims.STARTS, found, strict=True)
+    ]
+    found = against_crouch(rows)
+    assert [row["costlier"] for row in found] == [1, 1, 1]
+    assert [row["by at most [%]"] for row in found] == pytest.approx([1.1, 25.0, 20.0])
 
 
 @pytest.mark.slow
@@ -166,6 +234,22 @@ def test_every_notebook_of_the_package_has_its_table():
     assert all(r["the paper says"] and r["we do"] for r in rows)
 
 
+def test_every_id_that_differs_is_in_a_table():
+    """Terms of the stages whose equation is a printed one with a remark, and printed ones that none of them has."""
+    ids = re.compile(r"[A-Z]{2}-[A-Z]\d?")
+    terms = (Path(__file__).parent / "terms.txt").read_text(encoding="utf-8").splitlines()
+    own = {
+        line.split(" | ")[2] for line in terms if line.startswith(("SRMP/", "whole body/")) and line.count(" | ") > 2
+    }
+    kept = {x for equation in own for x in ids.findall(equation)}
+    changed = {x for equation in own if re.sub(r"[\s,]", "", ids.sub("", equation)) for x in ids.findall(equation)}
+    assert len(changed) > 10 and changed < kept
+    unlike = {"SF-B1", "SF-S", "JF-R1", "WL-J1", "WL-J2", "WF-J2", "WL-K2"}  # boxes, blends, shares, inputs, a place
+    stage_2 = {f"{stage}-C{k}" for stage, last in (("JL", 4), ("JF", 3)) for k in range(1, last + 1)}
+    said = {x for row in readings(notebooks.find_notebooks()) for x in ids.findall(row["the paper says"])}
+    assert (changed | unlike | stage_2) <= said, sorted((changed | unlike | stage_2) - said)
+
+
 # ------------------------------------------------------------------------------------------ what flights and trunks do
 
 
@@ -193,6 +277,102 @@ def test_what_is_drawn_in_counts_for_the_limbs_that_move(bhr):
     found = claims.drawn_in(run, bhr)
     assert found["lift-off"] == found["greatest"] == rho[2] and found["least"] == found["touchdown"] == rho[8]
     assert found["arms"] == 0 and found["legs"] == pytest.approx(rho[8] - rho[2])
+
+
+def launched(error):
+    """A run of 0.5 s until lift-off whose L is a plan's with peak -4, and an ``error`` over the time besides."""
+    t = np.arange(0.0, 0.7, STEP_S)
+    planned = -4.0 * t / t[-1]
+    tape = SimpleNamespace(t=t, extra={"planar_L": planned})
+    run = SimpleNamespace(t=t, L=planned + error(t), metrics=SimpleNamespace(liftoff_s=0.5))
+    return run, tape
+
+
+def test_momentum_is_compared_in_the_first_tenth_of_a_second_and_after():
+    """By shares of the planned peak; what comes after lift-off does not count."""
+    error = np.array([0.4, -0.08, 4.0])
+    found = claims.momentum_error(*launched(lambda t: error[np.searchsorted([0.0995, 0.4995], t)]))
+    assert found == pytest.approx((0.1, 0.02), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("error", "swings"),
+    [
+        (lambda t: 0.0 * t, (0, 0)),
+        (lambda t: 0.3 * t, (0, 0)),  # a drift
+        (lambda t: 0.2 * (np.abs(t - 0.03) < 0.0015), (2, 0)),  # one blow
+        (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t < 0.08), (8, 0)),  # four periods of 50 Hz
+        (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t > 0.2) * (t < 0.3), (0, 10)),
+        (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t > 0.46), (0, 0)),  # the plan is fast there itself
+        (lambda t: 0.015 * np.sin(2 * np.pi * 50 * t), (0, 0)),  # less than a hundredth of the peak
+    ],
+)
+def test_a_vibration_swings_to_and_fro(error, swings):
+    assert claims.vibration(*launched(error)) == pytest.approx(swings, abs=1 if max(swings) > 2 else 0)
+
+
+def test_swings_by_hand():
+    assert claims.swings(np.array([0, 1, 0, 1, 0.5, 1.2, -1]), 0.9) == 4
+    assert claims.swings(np.array([0, 0.4, 0.8, 1.2]), 0.9) == 1
+    assert claims.swings(np.zeros(5), 0.1) == 0
+
+
+def test_the_bow_is_where_the_push_begins():
+    """In degrees, from the first sample to where the CoM falls fastest before it rises fastest."""
+    rate = np.array([0.0, -0.5, -1.0, -0.2, 1.0, 3.0, -9.0])
+    pitch = np.array([0.1, 0.2, 0.1 + np.pi / 6, 0.9, 0.9, 0.9, 0.9])
+    assert claims.bow_deg(pitch, rate) == pytest.approx(30.0)
+
+
+def test_a_mean_over_twenty_milliseconds():
+    blow = np.zeros(100)
+    blow[40:50] = 1.0
+    assert claims.steady(blow).max() == pytest.approx(0.5) and len(claims.steady(blow)) == 81
+
+
+def test_tracking_by_hand(monkeypatch, bhr):
+    """Stage 2 against stage 1 at four nodes, two of them in the launch."""
+    zero, two = np.zeros(4), np.zeros((4, 2))
+    wanted = {"com": two, "com_velocity": np.add(two, [3, 4]), "L": np.array([0.0, -2, 9, 9]), "foot_com": two[2:],
+              "rho": zero + 4.0}  # fmt: skip
+    off = {"com": np.array([[0.3, 0.4], [0, 0], [9, 9], [9, 9]]), "com_velocity": np.add(two, [0.06, 0.08]),
+           "L": np.array([0.5, -0.2, 9, 9]), "rho": np.array([0.4, 0.4, 0.8, 0.8]),
+           "foot_com": np.array([[0.06, 0.08], [0.0, 0.02]])}  # fmt: skip
+    actual = {key: wanted[key] + off[key] for key in wanted}
+    monkeypatch.setattr("paper.tracking.compared", lambda *_: (actual, wanted))
+    found = tracking(SimpleNamespace(rows=lambda _: slice(0, 2)), None, bhr)
+    assert found == pytest.approx(
+        {
+            "takeoff_velocity": 0.1 / 5.0,
+            "takeoff_momentum": 0.1,
+            "launch_momentum": 0.25,
+            "launch_inertia_rms": 0.1,
+            "flight_inertia_rms": 0.2,
+            "launch_com": 0.5,
+            "flight_foot_rms": np.sqrt((0.1**2 + 0.02**2) / 2),
+            "touchdown_foot": 0.02,
+        }
+    )
+
+
+def test_how_a_launch_is_followed_by_hand(monkeypatch):
+    """Shares of the peaks of L and of the CoM's speed, and of the mean of the inertia."""
+    n, k = 6, 4
+    two = np.ones((n, 2))
+
+    def asked(launch_t, flight_t):
+        parts = (SimpleNamespace(L=np.full(len(t), -2.0), com_velocity=two[: len(t)] * [0.0, 2.0], rho_rate=0.0 * t,
+                                 rho=np.full(len(t), 4.0)) for t in (launch_t, flight_t))  # fmt: skip
+        return SimpleNamespace(**dict(zip(("launch", "flight"), parts, strict=True)))
+
+    column = {"L": np.full(n, -1.5), "rho": np.full(n, 4.2), "com_velocity": two * [0.03, 2.04], "toe_phase_start": 0.2}
+    tape = SimpleNamespace(t=np.array([0, 0.1, 0.2, 0.3, 0.3, 0.6]), takeoff_index=k, takeoff_time=0.3,
+                           extra={f"planar_{name}": x for name, x in column.items()})  # fmt: skip
+    peaks = SimpleNamespace(L=np.array([0.0, -5.0, 1.0]), com_velocity=np.array([[0.0, 0.0], [3.0, 4.0]]))
+    srmp = SimpleNamespace(launch_s=0.8, toe_s=0.1, flight_s=0.6, at=asked, launch=peaks)
+    monkeypatch.setattr("paper.tracking._rho_rate", lambda plan: np.zeros(n))
+    found = launch_followed(SimpleNamespace(tape=tape, srmp=srmp))
+    assert found == pytest.approx({"L": 0.1, "velocity": 0.05 / 5.0, "rho": 0.05})
 
 
 # ------------------------------------------------------------------------------------------ three steps against one
@@ -233,6 +413,7 @@ def test_a_stopped_study_goes_on(tmp_path, monkeypatch):
         return {"number": case.number, "method": method}
 
     monkeypatch.setattr(hard_cases, "solve", solve)
+    monkeypatch.setattr("paper.logs.code", lambda: {"sim": "0"})  # reading all sources takes seconds
     hard_cases.run(tmp_path / "log", asked[:1])
     rows = hard_cases.run(tmp_path / "log", asked)
     assert solved == [(0, "three-step"), (0, "direct"), (1, "three-step"), (1, "direct")]

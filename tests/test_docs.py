@@ -170,6 +170,28 @@ def test_these_checks_can_fail():
     assert unhinted(tree) == ["A.f", "g"] and not unhinted(ast.parse("def f(x: int, *, y: str = '') -> None: ..."))
 
 
+def torn(doc):
+    """Lines of a docstring's lists of parameters and attributes that the reference would take for one."""
+    lines, inside = doc.splitlines(), ""
+    for line, below in zip(lines, [*lines[1:], ""], strict=True):
+        if re.fullmatch("-{3,}", below):
+            inside = line
+        elif inside in ("Parameters", "Attributes") and re.match(r"[^\s-]", line):
+            if not re.fullmatch(r"[\w*, `]+ : .+", line):
+                yield line
+
+
+def test_the_reference_has_no_sentence_for_a_parameter():
+    assert list(torn("Short.\n\nParameters\n----------\nx, y : what\n    more\n\nAnd: more.")) == ["And: more."]
+    found = []
+    listed = {name.replace(".", "/") for name in re.findall(r"automodule:: ([\w.]+)", PAGES["api"])}
+    for path in (path for path in MODULES if short(path).removesuffix(".py") in listed):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for name, node in [("", tree), *public(tree)]:
+            found += [f"{short(path)} {name}: {line}" for line in torn(ast.get_docstring(node) or "")]
+    assert found == []
+
+
 def test_the_book_has_all_that_it_names():
     """Every module of the reference can be imported; every page is in the index."""
     modules = re.findall(r"automodule:: ([\w.]+)", PAGES["api"])

@@ -74,7 +74,7 @@ def test_six_lines_lead_to_a_robot_that_stands(tmp_path, monkeypatch):
     assert run.landed, run.reason
     assert abs(run.metrics.foot_distance_m - plan.task.distance_m) < 0.02
     again, shown = jl.load("out")
-    assert again.summary == plan.summary | {"manifest": again.summary["manifest"]}
+    assert again.summary == plan.summary | {"manifest": again.summary["manifest"], "audit": plan.audit.line()}
     assert (again.task, again.method, again.robot.hash) == (plan.task, plan.method, plan.robot.hash)
     np.testing.assert_array_equal(again.tape.tau, plan.tape.tau)
     np.testing.assert_array_equal(shown.q, run.q)

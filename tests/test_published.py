@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from fixtures_robots import reduction_error
 
-from jumplab.auditing import audit, audit_plan
+from jumplab.auditing import audit
 from jumplab.cli.main import main
 from jumplab.errors import RobotError, SolverError
 from jumplab.robot import Robot
@@ -91,7 +91,7 @@ def test_planned_clean_and_landed(name, target):
 def test_the_g1_runs_up_and_leaves_from_one_foot():
     robot = Robot.load("g1_arms")
     plan = Planner(robot).follow(Contacts.run_up(robot))
-    report = audit_plan(plan)
+    report = plan.audit
     assert report.passed, report.table()
     assert plan.tape.extra["contacts"][plan.tape.takeoff_index - 1].tolist() == [0, 1]  # the right one, on its toes
 

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -35,6 +36,27 @@ def test_a_plans_card_says_whether_its_audit_passed(plan):
     assert ">audit</td>" in plan._repr_html_() and "all 51 checks passed" in plan._repr_html_()
     other = replace(plan, task=replace(plan.task, distance_m=0.9))
     assert "of 51 checks failed: distance" in other._repr_html_()
+
+
+def test_a_plan_keeps_its_audit_and_how_it_landed(plan, monkeypatch, tmp_path):
+    """Made once, the same for the card, the summary and ``jl.audit``; a plan with faults is returned with a warning."""
+    assert plan.audit is plan.audit is jl.audit(plan) and plan.audit.sound
+    jl.save(tmp_path, plan)
+    assert jl.load(tmp_path).plan.summary["audit"] == plan.audit.line() == plan.verdict == "all 51 checks passed"
+    other = replace(plan, task=replace(plan.task, distance_m=0.9))
+    assert repr(other) == repr(plan)  # not audited yet
+    monkeypatch.setattr("jumplab.studies.advice.plan_or_advise", lambda *_: other)
+    with pytest.warns(UserWarning, match=r"^the plan is returned with its faults: 1 of 51 checks failed: distance$"):
+        assert jl.plan(plan.task, plan.robot) is other
+    assert repr(other).endswith("three-step, " + f"{plan.tape.t[-1]:.2f} s; {other.verdict}>")
+    clean = replace(plan)
+    monkeypatch.setattr("jumplab.sim.simulate_jump", lambda *_, **o: SimpleNamespace(landed=o["engine"] == "mujoco"))
+    for engine in ("mujoco", "bullet"):
+        assert (repr(clean) == repr(plan)) == (not clean.landings or all(clean.landings))
+        jl.simulate(clean, engine=engine)
+    assert clean.audit.passed and clean.verdict == "all 51 checks passed; not landed in 1 of 2 tries"
+    assert clean.verdict in repr(clean) and clean.verdict in clean._repr_html_()
+    assert plan.landings == [] == replace(clean).landings  # each plan has its own
 
 
 def test_the_rise_counts_from_take_off_and_the_apex_from_the_stance(plan):

@@ -5,8 +5,8 @@ In comes a tape with its robot, out goes an :class:`AuditReport`. Start reading 
 every limit stands in ``limits.toml``. :func:`judge` asks the same of motion clips.
 """
 
-from jumplab.auditing.audit import audit, audit_plan, write_audit
+from jumplab.auditing.audit import audit, write_audit
 from jumplab.auditing.clip import ClipReport, judge
 from jumplab.auditing.report import AuditReport, Check
 
-__all__ = ["AuditReport", "Check", "ClipReport", "audit", "audit_plan", "judge", "write_audit"]
+__all__ = ["AuditReport", "Check", "ClipReport", "audit", "judge", "write_audit"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from jumplab.arguments import real
 from jumplab.auditing import contact, dynamics, motion
@@ -37,12 +36,6 @@ GROUPS = (
 )
 
 
-def audit_plan(plan: Any) -> AuditReport:
-    """:func:`audit` of a plan, a :class:`jumplab.JumpPlan`, with all that it was asked for."""
-    edge_m = plan.summary["platform_edge_m"]
-    return audit(plan.tape, plan.robot, plan.task, edge_m=edge_m)
-
-
 def audit(
     tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: float | None = None
 ) -> AuditReport:
@@ -68,9 +61,11 @@ def audit(
         edge_m = real(edge_m, "edge_m", "m")
     open_tape(tape, robot, task)
     checks = _checks(motion.form(tape))
+    capture = []
     if all(c.passed for c in checks):
         r = replay(tape, robot, task, edge_m)
         checks += _checks(measure for group in GROUPS for measure in group(r))
+        capture = _checks(motion.capture(r))
     manifest = {
         "robot": robot.name,
         "robot_hash": robot.hash,
@@ -78,7 +73,7 @@ def audit(
         "samples": len(tape.t),
         "versions": versions(),
     }
-    return AuditReport(tuple(checks), manifest)
+    return AuditReport(tuple(checks), manifest, *capture)
 
 
 def _checks(measures: Iterable[Measure]) -> list[Check]:

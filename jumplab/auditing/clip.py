@@ -86,15 +86,15 @@ def judge(
     """Judge a motion: float, penetration, slip, flights against free fall, forces from nowhere,
     motors, joints, collisions.
 
+    Returns a report, of a folder and of a file with several clips a list of them. Raises
+    :class:`InputError` for what holds no clip of the robot.
+
     Parameters
     ----------
     motion : a plan, tape or simulation; a :class:`.Clip`; the path of a file as of
         :func:`.read_clips`, or of a folder of such files.
     robot : whose motion it is, if it does not carry its own.
     fps, order : as of :func:`.read_clips`.
-
-    Returns a report, of a folder and of a file with several clips a list of them. Raises
-    :class:`InputError` for what holds no clip of the robot.
     """
     if isinstance(motion, Clip):
         return _judged(motion)

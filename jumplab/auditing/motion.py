@@ -136,6 +136,24 @@ def target(r: Replay) -> Iterator[Measure]:
         yield from _asked(r, r.task)
 
 
+def capture(r: Replay) -> Iterator[Measure]:
+    """How far outside the soles a jump's capture point lies at touchdown, as a share of the CoM's
+    height over them.
+
+    The impact keeps the angular momentum about the soles' middle: the CoM goes on as an inverted
+    pendulum that has it, and would come to rest over the capture point.
+    """
+    if not r.is_jump:
+        return
+    points = r.sole_points[-1].reshape(-1, 3)
+    arm = r.com[-1] - points.mean(axis=0)
+    spin = r.momentum[-1] + r.mass * np.cross(arm, r.com_velocity[-1])
+    velocity = np.array([spin[1], -spin[0]]) / (r.mass * arm[2])
+    rests = r.com[-1, :2] + velocity * np.sqrt(arm[2] / r.gravity)
+    beyond = np.maximum(points.min(axis=0)[:2] - rests, rests - points.max(axis=0)[:2])
+    yield "capture point", norm(np.maximum(beyond, 0.0)) / arm[2], r.tape.t[-1:]
+
+
 def _turned(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """(K,) turn of directions (N, K) from first to last sample [rad], whole turns counted."""
     angles = np.unwrap(np.arctan2(y, x), axis=0)

@@ -91,19 +91,40 @@ Measure = tuple[Any, ...]
 class AuditReport(Shown):
     """Outcome of an audit: the checks in the order they were made, and what was audited.
 
+    ``capture`` is none of the checks: how far outside the soles the robot would come to rest from
+    the momentum that it lands with; None of what is no standing jump. A plan can be sound and still
+    not be caught.
     The manifest tells robot and its hash, target, number of samples, package versions;
     :func:`jumplab.auditing.write_audit` adds the plan's digest and the planner's own summary.
     """
 
     checks: tuple[Check, ...]
     manifest: dict = field(default_factory=dict)
+    capture: Check | None = None
 
     def line(self) -> str:
-        """How many checks passed, and which did not."""
-        if self.passed:
-            return f"all {len(self.checks)} checks passed"
-        names = ", ".join(c.name for c in self.failed)
-        return f"{len(self.failed)} of {len(self.checks)} checks failed: {names}"
+        """How many checks passed, and which did not; and whether it lands too fast to be caught."""
+        words = f"all {len(self.checks)} checks passed"
+        if not self.passed:
+            names = ", ".join(c.name for c in self.failed)
+            words = f"{len(self.failed)} of {len(self.checks)} checks failed: {names}"
+        return f"{words}; {self.uncaught}" if self.uncaught else words
+
+    @property
+    def sound(self) -> bool:
+        """True if every check passed, and nothing speaks against catching the landing."""
+        return self.passed and not self.uncaught
+
+    @property
+    def uncaught(self) -> str:
+        """Why a landing can hardly be caught; empty if nothing speaks against it."""
+        c = self.capture
+        if c is None or c.passed:
+            return ""
+        return (
+            f"but it lands too fast to be caught: the {c.name} lies {c.value:.0f} {c.unit} outside "
+            f"the soles, at most {c.limit:g} were caught; ask for less distance or rise"
+        )
 
     @property
     def passed(self) -> bool:
@@ -123,7 +144,8 @@ class AuditReport(Shown):
         """JSON text, strict (a value that is not finite is written as null)."""
         rows = [asdict(c) | {"passed": c.passed} for c in self.checks]
         verdict = {"schema": SCHEMA, "passed": self.passed, "failed": [c.name for c in self.failed]}
-        return to_json(verdict | {"checks": rows, "manifest": self.manifest})
+        capture = self.capture and asdict(self.capture)
+        return to_json(verdict | {"checks": rows, "capture": capture, "manifest": self.manifest})
 
     def table(self) -> str:
         """Plain text: one line per check, then one line per failure that says what was measured."""
@@ -140,4 +162,5 @@ class AuditReport(Shown):
                 )
         passed = len(self.checks) - len(self.failed)
         lines.append(f"{passed} of {len(self.checks)} checks passed")
-        return "\n".join(lines + [f"FAIL {c.name}: {c.note}" for c in self.failed])
+        lines += [f"FAIL {c.name}: {c.note}" for c in self.failed]
+        return "\n".join([*lines, self.uncaught] if self.uncaught else lines)

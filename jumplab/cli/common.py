@@ -239,7 +239,7 @@ def judge(audit: Any, folder: str) -> None:
             f"the plan fails {len(failed)} of {count} checks of its audit ({', '.join(failed)}); "
             f"see passport.json in {folder!r}"
         )
-    print(f"audit: all {count} checks passed")
+    print(f"audit: {audit.line()}")
 
 
 def print_summary(summary: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 import ast
 import json
 import time
+import warnings
 from argparse import Namespace
 from dataclasses import fields
 from pathlib import Path
@@ -83,9 +84,9 @@ def plan(args: Namespace) -> None:
     else:
         without(args, "says what --robust allows for, which is not given", disturb=[])
     options = given(api.plan, args, task=task, robot=robot, robust=ranges)
-    plan = api.plan(**options, atlas=atlas)
-    parts = (plan.tape, plan.robot, plan.summary)
-    report = store.write_plan(args.out, *parts, complete=auditing.write_audit)
+    with warnings.catch_warnings(action="ignore"):  # the audit is told below
+        plan = api.plan(**options, atlas=atlas)
+    report = api.save(args.out, plan)
     args.found |= {"out": args.out, "plan": plan.summary, "audit": _audited(report)}
     print_summary(plan.summary)
     if args.starts > 1:

@@ -66,6 +66,9 @@ def level(x: float) -> float:
 class Controller:
     """Joint torques of one jump, from measured states; it knows no simulator.
 
+    Raises :class:`InputError` if mode or landing make no sense, the tape is another robot's, or
+    ``feedback`` is asked in mode "pd".
+
     Parameters
     ----------
     mode : "position", "pd" or "whole-body", the servo that plays the tape until touchdown, see
@@ -91,9 +94,6 @@ class Controller:
         None until then.
     ahead : what the landing controller follows, and why.
     last_step : at which a robot that is still in the air is given up.
-
-    Raises :class:`InputError` if mode or landing make no sense, the tape is another robot's, or
-    ``feedback`` is asked in mode "pd".
     """
 
     @checked

@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jumplab.arguments import checked
-from jumplab.auditing import audit_plan
 from jumplab.errors import InputError, Shown
 from jumplab.show.bodies import robot_sheet
 from jumplab.show.jumps import inertia_and_momentum, joint_trajectories, jump_strobe, margins
@@ -76,8 +75,7 @@ def _of_plan(plan: JumpPlan) -> Card:
         "solving [s]": sum(row.solve_s for row in plan.statistics),
     }
     rows = [{"": name, "asked": asked.get(name), "planned": x} for name, x in planned.items()]
-    report = audit_plan(plan)
-    rows.append({"": "audit", "planned": report.line()})
+    rows.append({"": "audit", "planned": plan.verdict})
     return table(rows), jump_strobe(plan.tape, plan.robot)
 
 

@@ -93,7 +93,7 @@ for (const clip of clips) {
   clip.paints = Object.fromEntries(["trunk", "limb", "rest"].map((kind) => [kind, dull({ flatShading: parts.some((p) => p.faceted) })]));
   clip.joints = Array.from({ length: clip.bodies }, () => add(clip.group, new Group(), [0, 0, 0]));
   for (const { joint, kind, shape } of parts) add(clip.joints[joint], new Mesh(shape, clip.paints[kind]), [0, 0, 0]);
-  const bead = new SphereGeometry(0.007, 12, 8), landing = clip.phases.find(([, phase]) => phase === "landing");
+  const bead = new SphereGeometry(0.007, 12, 8), landing = clip.phases.findLast(([, phase]) => phase === "landing");
   let last = new Vector3(Infinity, 0, 0);
   for (let k = 0; k < clip.frames && k / facts.fps < (landing ? landing[0] + 0.6 : Infinity); k++) { // later it hardly moves
     const place = point(clip.path, 3 * k);
@@ -169,7 +169,7 @@ function seek(time) {
 const said = (x, digits) => x.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−"); // never "−0.0"
 
 // plan and simulation in figures, as long as both last
-const ROWS = [["travel of the toes", 0], ["rise of the CoM", 1]];
+const ROWS = [["travel of the toes", 0], ["CoM over take-off", 1]];
 function compare() {
   const [simulation, plan] = ["simulation", "plan"].map((name) => clips.find((clip) => clip.name === name));
   if (!simulation || !plan) return;

@@ -202,6 +202,10 @@ def simulate_jump(
 ) -> SimulationResult:
     """Play ``tape`` on a simulated robot, catch it, and watch it stand.
 
+    Returns a result of a jump that fails, too: see its ``landed`` and ``reason``. Raises
+    :class:`InputError` if the tape is not this robot's, an option makes no sense, the engine is not
+    there, or the robot cannot stand on the ground at the start.
+
     Parameters
     ----------
     tape : of a standing jump, or along any other contact schedule that begins on both feet.
@@ -215,10 +219,6 @@ def simulate_jump(
     contact : "hard", as plans assume, or "usual", the engine's own defaults.
     control : ``mode``, ``reaim``, ``step``, ``feedback`` and ``landing`` of
         :class:`jumplab.control.Controller`.
-
-    Returns a result of a jump that fails, too: see its ``landed`` and ``reason``. Raises
-    :class:`InputError` if the tape is not this robot's, an option makes no sense, the engine is not
-    there, or the robot cannot stand on the ground at the start.
     """
     _check(tape, stand_s)
     if control.get("feedback") and disturbance is not None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body import Contacts, WholeBodyPlan
 from jumplab.stages.whole_body.starts import Attempt
 from jumplab.task import JumpTask
+
+if TYPE_CHECKING:  # loaded with the first audit
+    from jumplab.auditing import AuditReport
 
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
@@ -51,6 +55,7 @@ class JumpPlan(Shown, Named):
     whole_body : result of stage 3 or of the direct planner; results of stages are None if the plan
         was read from a result folder.
     contacts : the schedule that was asked for; None for a standing jump.
+    landings : whether it landed, of each simulation by :func:`jumplab.simulate`.
     """
 
     task: JumpTask
@@ -62,6 +67,7 @@ class JumpPlan(Shown, Named):
     joints: JointPlan | None = None
     whole_body: WholeBodyPlan | None = None
     contacts: Contacts | None = None
+    landings: list[bool] = field(default_factory=list, init=False, compare=False)
 
     @classmethod
     def of(
@@ -104,14 +110,34 @@ class JumpPlan(Shown, Named):
         return cls(JumpTask(**given), robot, summary["method"], tape, dict(summary))
 
     def line(self) -> str:
-        """Robot, target and duration."""
+        """Robot, target and duration; once it was audited, why that fails or it can hardly land,
+        and how simulations ended.
+        """
         jump = f"{self.planned_distance_m:.2f} m far"
         if not self.task.in_plane:
             jump += f", {self.planned_side_m:.2f} m to the left"
         if self.task.rotation_rad:
             jump += f", turned by {round(math.degrees(self.task.rotation_rad))} deg"
         jump += f", rise {self.planned_rise_m:.2f} m"
-        return f"{self.robot.name}, {jump}, {self.method}, {float(self.tape.t[-1]):.2f} s"
+        words = f"{self.robot.name}, {jump}, {self.method}, {float(self.tape.t[-1]):.2f} s"
+        if "audit" not in vars(self) or (self.audit.sound and all(self.landings)):
+            return words
+        return f"{words}; {self.verdict}"
+
+    @cached_property
+    def audit(self) -> AuditReport:
+        """What the audit says of it, made when it is first asked for; see :func:`jumplab.audit`."""
+        from jumplab.auditing import audit
+
+        return audit(self.tape, self.robot, self.task, edge_m=self.summary["platform_edge_m"])
+
+    @property
+    def verdict(self) -> str:
+        """What the audit says, and in how many of its simulations it has not landed."""
+        words = self.audit.line()
+        if self.landings:
+            words += f"; not landed in {self.landings.count(False)} of {len(self.landings)} tries"
+        return words
 
     @property
     def statistics(self) -> tuple[StageRow, ...]:

@@ -64,6 +64,9 @@ class Planner:
     Whatever is changed here holds in every solve of every path: every start, finer meshes,
     re-plans, flips, the direct planner, chains. What would be ignored is refused.
 
+    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over
+    those too.
+
     Parameters
     ----------
     robot : who jumps.
@@ -85,9 +88,6 @@ class Planner:
     keep : keep the built problems for later processes, see :mod:`jumplab.ocp.cache`.
     atlas : of plans with the same robot, terms and limits: a :class:`jumplab.Atlas`. Direct plans
         begin with it where it has something close by; other methods refuse it.
-
-    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over
-    those too.
 
     Raises
     ------

@@ -8,7 +8,6 @@ import math
 from contextlib import suppress
 from dataclasses import replace
 
-from jumplab.auditing import audit_plan
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.io.progress import tell
 from jumplab.ocp.cache import remembered
@@ -130,8 +129,7 @@ def _refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | No
         plan = planner.plan(task, method)
     except JumplabError as e:
         return e
-    report = audit_plan(plan)
-    return None if report.passed else SolverError("its plan fails its audit", stage="audit")
+    return None if plan.audit.passed else SolverError("its plan fails its audit", stage="audit")
 
 
 def words(task: JumpTask, easier: JumpTask) -> str:

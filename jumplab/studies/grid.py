@@ -15,7 +15,6 @@ from typing import Any
 
 import joblib
 
-from jumplab.auditing.audit import audit_plan
 from jumplab.auditing.report import AuditReport
 from jumplab.errors import InfeasibleError, JumplabError
 from jumplab.robot import Robot
@@ -88,7 +87,7 @@ def plan_cell(
     row |= {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
     if plan is None:
         return row, None
-    report = audit_plan(plan)
+    report = plan.audit
     limiting, share = most_used(report, plan.robot)
     failed = ", ".join(check.name for check in report.failed)
     row |= {

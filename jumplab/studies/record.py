@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumplab.arguments import checked
-from jumplab.auditing import AuditReport, audit_plan
+from jumplab.auditing import AuditReport
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
@@ -228,10 +228,9 @@ def record(
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
     bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
-    report = audit_plan(plan)
     if given is None and not changes:
         keep_record(robot, what, value)
-    made = plan, report, found, ends, share, reserve, runs
+    made = plan, plan.audit, found, ends, share, reserve, runs
     asked = {"given": given, "share": share, "engines": engines, **changes}
     return Record(what, value, bound, *made, program, solved, asked)
 
@@ -332,9 +331,9 @@ class _Search:
                 failed = str(e)
                 continue
             plan = JumpPlan.of(robot, "direct", body)
-            if (report := audit_plan(plan)).passed:
+            if plan.audit.passed:
                 break
-            failed = ", ".join(check.name for check in report.failed)
+            failed = ", ".join(check.name for check in plan.audit.failed)
         else:
             raise SolverError(
                 f"robot {robot.name}: {self.what} reaches {getattr(self.task, self.what):.3f} at "

@@ -4,10 +4,10 @@ After ``jumplab run``, in the clone's root: ``python -m sphinx -b html -c notebo
 """
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 from docutils import nodes
-from docutils.utils.math.latex2mathml import tex2mathml
 
 from jumplab.io.folder import versions
 
@@ -17,9 +17,11 @@ EXECUTED = NOTEBOOKS.parent / "executed" / "notebooks"
 project, author = "jumplab", "The jumplab authors"
 release = version = versions()["jumplab"]
 root_doc = "book/index"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["paper", ".ipynb_checkpoints"]
-html_math_renderer = "mathml"  # browsers draw it themselves: the site asks for nothing outside itself
+# one file of MathJax goes with the site, which asks for nothing outside itself
+html_static_path = [str(Path(find_spec("mathjax").origin).parent / "static" / "mathjax" / "es5" / "tex-svg-full.js")]
+mathjax_path = "tex-svg-full.js"
 html_theme, html_title = "furo", f"jumplab {release}"
 html_extra_path = ["../../executed/jump.html"] if (EXECUTED.parent / "jump.html").is_file() else []
 nb_execution_mode = "off"  # `jumplab run` has executed them; what it has not is shown without outputs
@@ -27,6 +29,7 @@ myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]
 myst_heading_anchors = 3
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints = "description"
+autodoc_type_aliases = {"ArrayLike": "ArrayLike"}
 suppress_warnings = ["mystnb.unknown_mime_type", "myst.xref_missing", "docutils"]
 suppress_warnings += ["ref.python"]  # types in docstrings are short names, of which two classes may have the same
 
@@ -44,18 +47,20 @@ def front_page(app, exception):
     (Path(app.outdir) / "index.html").write_text(f"{page}<title>jumplab</title>\n", encoding="utf-8")
 
 
-def formula(translator, node):
-    """A formula as MathML; what only makes brackets larger is left out, as MathML does that by itself."""
-    tex = re.sub(r"\\[bB]ig+[lrm]?(?![a-zA-Z])", "", node.astext())
-    block = isinstance(node, nodes.math_block)
-    text = tex2mathml(f"{{}}{tex}" if tex.startswith("^") else tex, as_block=block)
-    translator.body.append(f'<div class="math">{text}</div>' if block else text)
-    raise nodes.SkipNode
+def sentences(app, what, name, obj, options, lines):
+    """Of ``name : words`` in a list of parameters the words are no type, which is in the annotation: put them below."""
+    inside, text = False, []
+    for above, line in zip(["", *lines], lines, strict=False):
+        if set(above.strip()) == {"-"}:
+            inside = text[-2].strip() in ("Parameters", "Attributes")
+        named = re.fullmatch(r"([\w*., `]+?) : (.+)", line)
+        text += [named[1], f"    {named[2]}"] if inside and named else [line]
+    lines[:] = text
 
 
 def setup(app):
     """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", sentences, priority=400)  # before napoleon reads them
     app.add_generic_role("mpltype", nodes.literal)  # of matplotlib's own docstrings, which figures inherit
-    app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("source-read", with_outputs)
     app.connect("build-finished", front_page)

@@ -7,7 +7,6 @@ the rows.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from functools import cache
@@ -16,11 +15,11 @@ from typing import Any
 
 from jumplab import api
 from jumplab.errors import JumplabError
-from jumplab.io.files import write_file
 from jumplab.robot import Robot
 from jumplab.sim import INSTALLED
 from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
+from paper import logs
 
 TABLE = Path(__file__).with_name("acrobatics.json")
 # robot, factors on efforts and on speeds of all motors, distance, rise, platform [m], turns about +y, method
@@ -44,7 +43,7 @@ ASKED: list[Asked] = [
 
 def rows() -> list[dict[str, Any]]:
     """The table: what was asked, what became of the plan, which limit it uses most, and how it landed."""
-    return json.loads(TABLE.read_text(encoding="utf-8"))
+    return logs.table(TABLE)
 
 
 @cache
@@ -133,7 +132,7 @@ def main() -> None:
     for asked in ASKED:
         if not any(all(row[k] == x for k, x in zip(KEYS, asked, strict=True)) for row in done):
             done.append(attempt(asked))
-            write_file(TABLE, ("[\n" + ",\n".join(map(json.dumps, done)) + "\n]\n").encode())
+            logs.write_table(TABLE, done)
             print(*asked, done[-1]["clean"], done[-1]["said"], done[-1].get("landed"), flush=True)
 
 

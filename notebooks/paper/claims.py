@@ -6,7 +6,7 @@ import itertools
 import json
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,12 +33,15 @@ from jumplab.task import GRAVITY, JumpTask
 from paper.expansion import expand
 from paper.planar import planar_quantities
 
-HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "cannot be checked here"
+HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "open: cannot be checked here"
 ADOPTED = "adopted: ours by construction"
+INF = np.inf
 STARTS = ("crouch", "stage 2", "looser stage 3")
 LOOSE_MESH = Mesh(6, 4, 6)  # half of stage 3's mesh ...
 LOOSE_TOLERANCE = {"tol": 1e-2, "constr_viol_tol": 5e-5}  # ... and tolerances that leave millimetres open
 SAME_COST = 1.01  # more than this times the least cost known is another jump
+FIRST_S, LAST_S, STEADY_S = 0.1, 0.05, 0.02  # of the launch: where it begins, ends; over which peaks of contacts pass
+SWING = 0.01  # of the peak of L: less is not seen in a figure of it
 READINGS = ("the paper says", "we do", "because", "effect")
 HEADING = "## Differences from the paper"
 
@@ -46,35 +49,183 @@ HEADING = "## Differences from the paper"
 # ---------------------------------------------------------------------------------------------- verdicts
 
 
-def judge(
-    claim: str, ok: bool | None, measured: str, where: str, change: str = "", *, adopted: bool = False
-) -> dict[str, str]:
+@dataclass(frozen=True)
+class Claim:
+    """A sentence of the paper, and what decides it.
+
+    Attributes
+    ----------
+    sentence : what is said, in our words.
+    where : notebook that shows it at length.
+    limits : what is measured, with its unit -> least and most for which the claim holds; None if nothing here can tell.
+    adopted : whether the measurement reads back what was built so; it can fail, but proves nothing of the paper.
+    """
+
+    sentence: str
+    where: str
+    limits: Mapping[str, tuple[float, float]] | None
+    adopted: bool = False
+
+    @property
+    def words(self) -> str:
+        """The limits in words."""
+        return "; ".join(f"{name} {_range(*ends)}" for name, ends in (self.limits or {}).items()) or "none"
+
+
+def _range(least: float, most: float) -> str:
+    if least == most:
+        return f"= {least:g}"
+    if np.isinf(most):
+        return f"≥ {least:g}"
+    return f"≤ {most:g}" if least in (0, -INF) else f"{least:g} … {most:g}"
+
+
+# in the order of the paper
+CLAIMS = {
+    "jumps": Claim(
+        "The robot jumps more than a metre forward, and in another jump onto half a metre.",
+        "06_experiments",
+        {"toe to toe [m]": (1.0, INF), "CoM up on the platform [m]": (0.48, 0.52), "jumps that stand": (2, 2)},
+    ),
+    "time": Claim(
+        "All optimisations together take about ten seconds, or less.",
+        "00_overview",
+        {"slowest plan [CPU s]": (0, 10)},
+    ),
+    "chain": Claim(
+        "Three optimisations in a chain, each with its own model.",
+        "04_whole_body",
+        {"stages that solve": (3, 3), "coordinates of 1": (4, 4), "of 2": (20, 20), "of 3": (7, 7)},
+        adopted=True,
+    ),
+    "size": Claim(
+        "The robot is about 1.5 m high, weighs 42 kg and has 14 joints.",
+        "01_models",
+        {"height [m]": (1.45, 1.55), "mass [kg]": (41.5, 42.5), "joints": (14, 14)},
+        adopted=True,
+    ),
+    "links": Claim(
+        "Nine links, 20 degrees of freedom: six of the base, per side one shoulder, three hip, one knee, two ankle.",
+        "01_models",
+        {"links": (9, 9), "degrees of freedom": (20, 20), "shoulder": (2, 2), "hip": (6, 6), "knee": (2, 2),
+         "ankle": (4, 4)},
+        adopted=True,
+    ),
+    "five links": Claim(
+        "Five links in the sagittal plane stand for nine when both sides move alike; a leg carries the mass of two.",
+        "01_models",
+        {"largest difference [SI]": (0, 1e-9)},
+    ),
+    "wrenches": Claim(
+        "The ground acts on the nine links by twelve numbers, a force and a torque per foot.",
+        "03_joint_space_mapping",
+        {"rows of the contact Jacobian": (12, 12)},
+        adopted=True,
+    ),
+    "gravity": Claim(
+        "Gravity is 9.8 m/s².",
+        "01_models",
+        {"least [m/s²]": (9.8, 9.8), "most [m/s²]": (9.8, 9.8)},
+        adopted=True,
+    ),
+    "ballistics": Claim(
+        "Take-off speed and time in the air follow from the rise alone.",
+        "02_srmp",
+        {"speed off the rule [m/s]": (0, 0.03), "time off the rule [s]": (0, 0.05)},
+    ),
+    "sensors": Claim(
+        "A control cycle of 1 ms, a gyroscope up to 250 deg/s and an accelerometer up to 8 g serve the jump.",
+        "05_simulation",
+        {"cycle [ms]": (1, 1), "turning [deg/s]": (0, 250), "acceleration over 20 ms [g]": (0, 8)},
+    ),
+    "open loop": Claim(
+        "Launch and flight are played in position mode without any correction; a controller in torque mode lands.",
+        "05_simulation",
+        {"stands": (1, 1), "checks failed": (0, 0), "mode position": (1, 1), "corrections switched on": (0, 0)},
+    ),
+    "differs": Claim(
+        "The simulated robot differs a little from the planned one, and misses a little.",
+        "05_simulation",
+        {"robots": (20, INF), "miss of the distance, median [mm]": (1, 50), "share that lands": (0.9, 1)},
+    ),
+    "bias": Claim(
+        "A bias on the goal removes that error.",
+        "06_experiments",
+        {"robots": (20, INF), "share that hits the goal": (0.9, 1)},
+    ),
+    "guess": Claim(
+        "Stage 2's motion as a guess speeds stage 3 up, more efficiently than a looser stage 3 would.",
+        "03_joint_space_mapping",
+        {"targets": (24, INF), "time, all counted, of the crouch's": (0, 0.95), "of the looser stage 3's": (0, 0.95)},
+    ),
+    "tracks": Claim(
+        "The whole body precisely tracks the trajectory of the angular momentum.",
+        "04_whole_body",
+        {"L off, rms, share of its peak": (0, 0.1)},
+    ),
+    "bows": Claim(
+        "The trunk first bends forward and then accelerates, in the plan of stage 1 as in simulation.",
+        "02_srmp",
+        {"stage 1 [deg]": (3, INF), "simulation [deg]": (3, INF)},
+    ),
+    "shapes": Claim(
+        "In flight legs and arms are drawn in to shape the inertia, and the feet swing to where they land.",
+        "05_simulation",
+        {"least rho of that at lift-off": (0, 0.95), "change by the legs [kg m²]": (-INF, -0.01),
+         "by the arms [kg m²]": (-INF, -0.01), "soles ahead of the CoM [m]": (0.01, INF)},
+    ),
+    "vibrates": Claim(
+        "Angular momentum vibrates when the launch begins and then follows its reference.",
+        "05_simulation",
+        {"swings at first": (3, INF), "swings later": (0, 0), "off later, rms, share of the peak": (0, 0.05)},
+    ),
+    "hardware": Claim(
+        "A robot that is not its model misses height and angular momentum, and reaches its target all the same.",
+        "06_experiments",
+        None,
+    ),
+    "flip": Claim(
+        "A target angle of a full turn gives a backflip; jumps to the side and in a row are left to later work.",
+        "02_srmp",
+        {"turn of stage 1 off [rad]": (0, 0.3)},
+        adopted=True,
+    ),
+    "posture": Claim(
+        "Stage 2 leaves an unexpected posture at touchdown, which does no harm.",
+        "03_joint_space_mapping",
+        {"posture off [deg]": (20, INF), "checks failed": (0, 0), "costlier targets": (0, 0)},
+    ),
+}  # fmt: skip
+
+
+def judge(name: str, measured: str, values: Mapping[str, float] | None = None, change: str = "") -> dict[str, str]:
     """One line of the table of claims.
 
     Parameters
     ----------
-    claim : what is said, in one sentence.
-    ok : whether the measurement agrees; None if nothing here can tell.
-    measured : the numbers, with units.
-    where : notebook that shows it at length.
+    name : of :data:`CLAIMS`.
+    measured : the numbers in words, with units.
+    values : what was measured, by the names of the claim's limits; not a number keeps no limit.
     change : what was read, done or found differently, where that is part of the verdict.
-    adopted : whether the measurement reads back what was built so; it can fail, but proves nothing of the paper.
 
     Raises
     ------
     InputError
-        If a text is empty, or ``ok`` is neither a truth value nor None.
+        If there is no such claim, the text is empty, or the values are not those of the limits.
     """
-    for name, text in (("claim", claim), ("measured", measured), ("where", where)):
-        if not (isinstance(text, str) and text.strip()):
-            raise InputError(f"{name} of a claim must be a text, got {quoted(text)}; say what was measured and where")
-    if ok is not None and not isinstance(ok, bool | np.bool_):
-        raise InputError(
-            f"verdict of a claim must be True, False or None, got {quoted(ok)}; compare the number with a limit"
-        )
-    agreed = ADOPTED if adopted else CHANGED if change else HOLDS
-    verdict = OPEN if ok is None else agreed if ok else FAILS
-    return {"claim": claim, "verdict": verdict, "measured": measured, "change": change, "where": where}
+    if name not in CLAIMS:
+        raise InputError(f"there is no claim {quoted(name)}; choose of {', '.join(CLAIMS)}")
+    if not (isinstance(measured, str) and measured.strip()):
+        raise InputError(f"measured of a claim must be a text, got {quoted(measured)}; say what was measured")
+    claim, values = CLAIMS[name], values or {}
+    limits = claim.limits or {}
+    if set(values) != set(limits):
+        raise InputError(f"claim {name!r}: measured are {', '.join(values) or 'no values'}; it needs {claim.words}")
+    ok = all(least <= values[key] <= most for key, (least, most) in limits.items())
+    agreed = ADOPTED if claim.adopted else CHANGED if change else HOLDS
+    verdict = OPEN if claim.limits is None else agreed if ok else FAILS
+    row = {"claim": claim.sentence, "verdict": verdict, "holds if": claim.words, "measured": measured}
+    return row | {"change": change, "where": claim.where}
 
 
 class Verdicts(list):
@@ -289,7 +440,7 @@ def trunk_feels(run: SimulationResult, robot: Robot) -> np.ndarray:
     return np.linalg.norm(np.diff(velocity, axis=0) / STEP_S - gravity, axis=1) / np.linalg.norm(gravity)
 
 
-def steady(values: np.ndarray, span_s: float = 0.02) -> np.ndarray:
+def steady(values: np.ndarray, span_s: float = STEADY_S) -> np.ndarray:
     """Means of ``values`` (N,) over a time [s]: shorter peaks are those of rigid contacts and the engine's step."""
     size = round(span_s / STEP_S)
     return np.convolve(values, np.full(size, 1 / size), mode="valid")
@@ -297,11 +448,52 @@ def steady(values: np.ndarray, span_s: float = 0.02) -> np.ndarray:
 
 def momentum_error(run: SimulationResult, tape: Tape) -> tuple[float, float]:
     """Root mean square of simulated less planned L in the launch's first 0.1 s, and after, in shares of the peak."""
-    down = run.t < run.metrics.liftoff_s
-    error = (run.L - np.interp(run.t, tape.t, tape.extra["planar_L"]))[down]
-    start, top = run.t[down] < 0.1, np.abs(tape.extra["planar_L"]).max()
-    first, later = (float(np.sqrt(np.mean(e**2)) / top) for e in (error[start], error[~start]))
+    first, later = (float(np.sqrt(np.mean(e**2))) for e in _momentum_off(run, tape))
     return first, later
+
+
+def _momentum_off(run: SimulationResult, tape: Tape) -> tuple[np.ndarray, np.ndarray]:
+    """Simulated less planned L in the launch's first 0.1 s (n,), and after (m,), in shares of the planned peak."""
+    down = run.t < run.metrics.liftoff_s
+    planned = tape.extra["planar_L"]
+    error = (run.L - np.interp(run.t, tape.t, planned))[down] / np.abs(planned).max()
+    start = run.t[down] < FIRST_S
+    return error[start], error[~start]
+
+
+def vibration(run: SimulationResult, tape: Tape) -> tuple[int, int]:
+    """How often simulated less planned L swings by more than :data:`SWING` in the first 0.1 s, and after, until 50 ms
+    before lift-off, where the plan itself is fast.
+
+    A vibration swings to and fro; one blow makes two swings, a drift none, since its mean over 20 ms is taken away.
+    """
+    size = round(STEADY_S / STEP_S) | 1
+    whole = np.concatenate(_momentum_off(run, tape))
+    slow = np.convolve(np.pad(whole, size // 2, mode="edge"), np.full(size, 1 / size), mode="valid")
+    cut = round(FIRST_S / STEP_S)
+    fast = (whole - slow)[: -round(LAST_S / STEP_S)]
+    return swings(fast[:cut], SWING), swings(fast[cut:], SWING)
+
+
+def swings(values: np.ndarray, least: float) -> int:
+    """How many times ``values`` (N,) go up or down by at least ``least``, smaller turns between left out."""
+    count, way, end = 0, 0, float(values[0])
+    for x in values:
+        if way * (x - end) > 0:
+            end = x  # goes on
+        elif abs(x - end) >= least:
+            way, end, count = (1 if x > end else -1), x, count + 1
+    return count
+
+
+def bow_deg(pitch: np.ndarray, rate: np.ndarray) -> float:
+    """How far a trunk is bent forward from where it begins [deg] when the push begins.
+
+    ``pitch`` (N,) [rad], ``rate`` (N,) at which the CoM rises [m/s]: the push begins where it falls fastest, before it
+    rises fastest.
+    """
+    push = int(np.argmin(rate[: np.argmax(rate)]))
+    return float(np.degrees(pitch[push] - pitch[0]))
 
 
 def touchdown_postures(plan: JumpPlan) -> list[dict[str, float | str]]:

@@ -6,12 +6,12 @@ be stopped and started again. Notebook 10 draws the file.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from scipy.stats import qmc
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import JumplabError, SolverError
-from jumplab.io.files import open_log
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
 from jumplab.stages.joint_qp import map_to_joints
@@ -35,6 +34,7 @@ from jumplab.stages.whole_body.motions import Motion, along
 from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.starts import GIVEN
 from jumplab.task import JumpTask
+from paper import logs
 
 LOG = Path(__file__).with_name("hard_cases.jsonl")
 KINDS = ("targets", "platforms", "flips", "tight limits", "other robots", "bad guesses")
@@ -151,24 +151,18 @@ def solve(case: Case, method: str) -> dict[str, Any]:
 
 def run(path: str | Path = LOG, asked: Sequence[Case] | None = None) -> list[dict[str, Any]]:
     """Rows of both methods for the cases asked for, in their order; what the file has is not solved again."""
-
-    def entry(line: dict[str, Any]) -> tuple[tuple[int, str], dict[str, Any]]:
-        return (line["number"], line["method"]), line
-
     asked = cases() if asked is None else asked
-    with open_log(path, "study", entry) as log:
+    with logs.keep(Path(path), itemgetter("number", "method")) as log:
         for case in asked:
             for method in METHODS:
                 if (case.number, method) not in log.done:
-                    log.done[case.number, method] = row = solve(case, method)
-                    log.add(row)
+                    log.add(solve(case, method))
         return [log.done[case.number, method] for case in asked for method in METHODS]
 
 
 def read(path: str | Path = LOG) -> list[dict[str, Any]]:
     """Rows of a file that :func:`run` has written, in the order of their cases; nothing is solved."""
-    lines = Path(path).read_text(encoding="utf-8").splitlines()
-    return sorted(map(json.loads, lines), key=lambda row: (row["number"], METHODS.index(row["method"])))
+    return sorted(logs.rows(Path(path)), key=lambda row: (row["number"], METHODS.index(row["method"])))
 
 
 def _pairs(rows: Sequence[Mapping[str, Any]], kind: str) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:

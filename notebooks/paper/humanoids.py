@@ -7,7 +7,6 @@ for the highest jump on the spot of those that are planned in the plane. Noteboo
 
 from __future__ import annotations
 
-import json
 import resource
 import sys
 from collections.abc import Callable
@@ -32,6 +31,7 @@ from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import METHODS, Planner
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.task import GRAVITY, MAX_HEIGHT_M, JumpTask
+from paper import logs
 
 TABLE = Path(__file__).with_name("humanoids.json")
 LEG = ("hip_pitch", "knee", "ankle_pitch")
@@ -46,7 +46,7 @@ LADDER_S = 1800.0  # and for all plans of a ladder
 
 def rows() -> list[dict[str, Any]]:
     """The table: name, repository, file, the legs' joints as a person read them, and what became of the robot."""
-    return json.loads(TABLE.read_text(encoding="utf-8"))
+    return logs.table(TABLE)
 
 
 # [1] the rod's swing adds to a straight push; stage 1 was seen up to 5.6 % beyond it
@@ -239,7 +239,7 @@ def main(folder: str, *options: str) -> None:
         print(
             row["name"], told["legs right"], told["faults"][:1], row.get("jump", ""), row.get("highest", ""), flush=True
         )
-        TABLE.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        logs.write_table(TABLE, table)
 
 
 if __name__ == "__main__":

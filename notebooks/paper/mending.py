@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,9 @@ from jumplab.auditing.clip import ClipReport
 from jumplab.auditing.report import LIMITS
 from jumplab.errors import JumplabError
 from jumplab.io.clip import ENDINGS
-from jumplab.io.files import write_file
 from jumplab.sim import ENGINES
 from jumplab.studies.mend import Mended
+from paper import logs
 
 LOG = Path(__file__).with_name("mending.jsonl")
 # what a mended clip keeps: joints [rad] rms, footholds [m], and of each flight its rise [m] or its time [1]
@@ -29,13 +29,9 @@ def study(folder: str | Path, path: Path = LOG, robot: str = "g1") -> None:
 
     Clips that the log has are passed over. ``python -m paper.mending DIR`` calls it.
     """
-    rows = stored(path) if path.is_file() else []
-    known = {row["clip"] for row in rows}
-    clips = sorted(x for x in Path(folder).iterdir() if x.suffix in ENDINGS and x.stem not in known)
-    for clip in clips:
-        rows.append(row_of(jl.judge(clip, robot)))
-        text = "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
-        write_file(path, text.encode())
+    with logs.keep(path, itemgetter("clip"), robot=jl.Robot.load(robot)) as log:
+        for clip in sorted(x for x in Path(folder).iterdir() if x.suffix in ENDINGS and x.stem not in log.done):
+            log.add(row_of(jl.judge(clip, robot)))
 
 
 def row_of(before: ClipReport) -> dict[str, Any]:
@@ -80,7 +76,7 @@ def causes(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def stored(path: Path = LOG) -> list[dict[str, Any]]:
     """The kept rows."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return logs.rows(path)
 
 
 def kept(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,16 +7,15 @@ speaks.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from jumplab.errors import JumplabError
-from jumplab.io.files import open_log
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED
 from jumplab.show.tables import Table, table
@@ -25,6 +24,7 @@ from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.bounds import most
 from jumplab.studies.record import record
 from jumplab.task import JumpTask
+from paper import logs
 
 LOG = Path(__file__).with_name("records.jsonl")
 WHAT = ("height_m", "distance_m")
@@ -70,7 +70,7 @@ def row(name: str, what: str) -> dict[str, Any]:
 
 def rows() -> list[dict[str, Any]]:
     """The records on file."""
-    return [json.loads(line)["row"] for line in LOG.read_text(encoding="utf-8").splitlines()]
+    return [line["row"] for line in logs.rows(LOG)]
 
 
 def missing(done: Any) -> Iterator[tuple[str, str]]:
@@ -117,7 +117,7 @@ def main() -> None:
     if sys.argv[1:] == ["table"]:
         print(records_table())
         return
-    with open_log(LOG, "records", lambda line: (line["key"], line["row"])) as log:
+    with logs.keep(LOG, itemgetter("key")) as log:
         for name, what in missing(log.done):
             found = row(name, what)
             log.add({"key": f"{name} {what}", "row": found})

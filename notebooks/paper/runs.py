@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +11,6 @@ from typing import Any
 
 import joblib
 
-from jumplab.io.files import write_file
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, SimulationResult, simulate_jump
@@ -20,6 +18,7 @@ from jumplab.sim.result import STAND_S
 from jumplab.studies.study import in_parallel
 from jumplab.studies.trials import Trial, TrialSettings, run_trials, wilson
 from jumplab.task import JumpTask
+from paper import logs
 from paper.basin import landing_basin
 
 LOG, ROBOTS = Path(__file__).with_name("trials.jsonl"), 250  # drawn in each engine
@@ -83,7 +82,7 @@ def study(folder: str | Path, path: Path = LOG) -> None:
         settings = TrialSettings(engine=engine)
         done = *run_trials(folder, ROBOTS, settings=settings).trials, *landing_basin(folder, None, settings).trials
         rows += [row(engine, trial) for trial in done]
-    write_file(path, "".join(json.dumps(r) + "\n" for r in rows).encode())
+    logs.write(path, rows, folder=folder)
 
 
 def row(engine: str, trial: Trial) -> dict[str, Any]:
@@ -100,10 +99,9 @@ def stored(engine: str, feature: str, path: Path = LOG) -> list[SimpleNamespace]
 
     "delay_s" is of the robots, "speed_factor" of the basin's states.
     """
-    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     here = (
         SimpleNamespace(**{"foot_distance_m": None, **r})
-        for r in rows
+        for r in logs.rows(path)
         if r["engine"] == engine and feature in r["features"]
     )
     return sorted(here, key=lambda r: r.number)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterable
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ from scipy.integrate import trapezoid
 
 import jumplab as jl
 from jumplab.errors import SolverError
-from jumplab.io.files import write_file
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, by_phase, new_figure
 from jumplab.stages.plan import JumpPlan, planned
+from paper import logs
 
 LOG = Path(__file__).with_name("schedules.jsonl")
 ROBOTS = "bhr", "g1_arms"
@@ -47,13 +48,10 @@ def study(folder: str | Path, path: Path = LOG, robots: Iterable[str] = ROBOTS) 
 
     What the log has is not done again. ``python -m paper.schedules DIR`` calls it.
     """
-    rows = stored(path) if path.is_file() else []
-    done = {(row["robot"], row["case"]) for row in rows}
-    for robot in robots:
-        for case in CASES:
-            if (robot, case) not in done:
-                rows.append({"robot": robot, "case": case} | _row(Path(folder) / f"{robot} {case}", robot, case))
-                write_file(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in rows).encode())
+    with logs.keep(path, itemgetter("robot", "case")) as log:
+        for robot, case in product(robots, CASES):
+            if (robot, case) not in log.done:
+                log.add({"robot": robot, "case": case} | _row(Path(folder) / f"{robot} {case}", robot, case))
 
 
 def _row(folder: Path, robot: str, case: str) -> dict[str, Any]:
@@ -95,7 +93,7 @@ def _planned(folder: Path, robot: str, words: str) -> JumpPlan:
 
 def stored(path: Path = LOG) -> list[dict[str, Any]]:
     """The kept rows."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return logs.rows(path)
 
 
 def table(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

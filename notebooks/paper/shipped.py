@@ -6,7 +6,6 @@ as they are now; those whose package is not there keep their rows. Notebook 07 d
 
 from __future__ import annotations
 
-import json
 import sys
 from itertools import product
 from pathlib import Path
@@ -20,6 +19,7 @@ from jumplab.robot.files import SHIPPED
 from jumplab.sim import INSTALLED
 from jumplab.studies.envelope import Cell, Envelope, envelope
 from jumplab.task import JumpTask
+from paper import logs
 from paper.humanoids import SHARES, leg_m
 
 TABLE = Path(__file__).with_name("shipped.json")
@@ -29,7 +29,7 @@ LESS = (1.0, 0.75, 0.5, 0.25)  # of SHARES, the first that is clean and stands i
 
 def rows() -> dict[str, dict[str, Any]]:
     """By robot: its hash, planner, mass, the jump with its playbacks, and the cells of the map."""
-    return json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.exists() else {}
+    return logs.table(TABLE) if TABLE.exists() else {}
 
 
 def measured(robot: Robot) -> dict[str, Any]:
@@ -104,7 +104,7 @@ def main(*names: str) -> None:
             continue
         if table.get(name, {}).get("hash") != robot.hash:
             table = {n: row for n in SHIPPED if (row := measured(robot) if n == name else table.get(n))}
-            TABLE.write_text(json.dumps(table, ensure_ascii=False) + "\n", encoding="utf-8")
+            logs.write_table(TABLE, table)
         print(name, table[name]["jump"], flush=True)
 
 

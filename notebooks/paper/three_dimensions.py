@@ -7,7 +7,6 @@ tell ``attempts`` were made by the whole-body program, the others by the program
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
@@ -25,7 +24,6 @@ from jumplab import sim
 from jumplab.auditing import audit
 from jumplab.control.servo import SERVOS
 from jumplab.errors import JumplabError
-from jumplab.io.files import open_log
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import (
@@ -44,6 +42,7 @@ from jumplab.stages.planner import JumpPlan, Planner
 from jumplab.studies.grid import most_used
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trial, wilson
 from jumplab.task import JumpTask
+from paper import logs
 
 LOG = Path(__file__).with_name("three_dimensions.jsonl")
 AHEAD, SIDE, YAW_DEG, RISE = (0.0, 0.3, 0.6, 0.9), (0.15, 0.3, 0.45, 0.6), (45, 90, 135, 180), (0.2, 0.3, 0.4, 0.5)
@@ -120,12 +119,9 @@ def played(plan: JumpPlan, engine: str, mode: str) -> dict[str, Any]:
 def run(path: str | Path = LOG, kinds: Iterable[str] = tuple(KINDS)) -> None:
     """Solve what the file lacks."""
 
-    def entry(line: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return (line["kind"], *line["target"]), line
-
     planner = Planner(Robot.load(), keep=True)
     planner.plan(JumpTask(0.0, 0.3, side_m=0.1))  # the first call of anything is not timed
-    with open_log(path, "study", entry) as log:
+    with logs.keep(Path(path), lambda row: (row["kind"], *row["target"]), robot=planner.robot) as log:
         for kind in kinds:
             for target in KINDS[kind]:
                 if (kind, *target) not in log.done:
@@ -134,9 +130,8 @@ def run(path: str | Path = LOG, kinds: Iterable[str] = tuple(KINDS)) -> None:
 
 def read(path: str | Path = LOG) -> dict[str, list[dict[str, Any]]]:
     """Rows of a file that :func:`run` has written, by kind; nothing is solved."""
-    rows = map(json.loads, Path(path).read_text(encoding="utf-8").splitlines())
     out: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
-    for row in rows:
+    for row in logs.rows(Path(path)):
         out[row["kind"]].append(row)
     return out
 

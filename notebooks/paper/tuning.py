@@ -13,6 +13,7 @@ import sys
 import tokenize
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,12 @@ import numpy as np
 import jumplab
 from jumplab.auditing.audit import audit
 from jumplab.errors import JumplabError
-from jumplab.io.files import open_log
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.task import JumpTask
+from paper import logs
 
 LOG = Path(__file__).with_name("tuning.jsonl")
 PAGE = Path(__file__).parent.parent / "tuning.md"
@@ -103,11 +104,6 @@ def cases() -> Iterator[tuple[str, str, Any, dict[str, Any]]]:
                 yield robot, number.name, value, changes(number, value)
 
 
-def entry(row: dict[str, Any]) -> tuple[str, list[dict[str, float] | None]]:
-    """Key and value of a line of the log."""
-    return row["case"], row["plans"]
-
-
 def case_of(robot: str, name: str, value: Any) -> str:
     """Key of a run."""
     return f"{robot} {name} {json.dumps(value)}"
@@ -115,13 +111,12 @@ def case_of(robot: str, name: str, value: Any) -> str:
 
 def measure() -> None:
     """Solve what the log lacks."""
-    with open_log(LOG, "study", entry) as log:
+    with logs.keep(LOG, itemgetter("case")) as log:
         for robot, name, value, options in cases():
             case = case_of(robot, name, value)
             if case not in log.done:
                 print(case, file=sys.stderr)
-                log.done[case] = measured(robot, options)
-                log.add({"case": case, "plans": log.done[case]})
+                log.add({"case": case, "plans": measured(robot, options)})
 
 
 # ------------------------------------------------------------------------------------------ tables
@@ -146,7 +141,7 @@ def compared(plans: list[dict[str, float] | None], shipped: list[dict[str, float
 
 def first_table() -> str:
     """The dozen, as Markdown: each with both values that were tried, on each robot."""
-    done = dict(entry(json.loads(line)) for line in LOG.read_text(encoding="utf-8").splitlines())
+    done = {row["case"]: row["plans"] for row, _ in logs.lines(LOG)}
     defaults = {"limits": Limits(), "weights": Weights(), "mesh": Mesh()}
     rows = []
     for number in FIRST:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterable
@@ -10,12 +9,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from jumplab.io.files import write_file
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, Perturbation, Ranges, Scene, SimulationResult, simulate_jump
 from jumplab.studies.margins import MarginReport, ranges_at
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
+from paper import logs
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
 FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), 200, 11
@@ -65,7 +64,7 @@ def study(folder: str | Path, path: Path = LOG, *, jobs: int | None = None) -> N
         for trial in run_trials(folder, robots, SEED, settings, jobs=jobs).trials:
             row = {"world": world, "engine": engine, "re-aim": reaim, "number": trial.key.index, "landed": trial.landed}
             rows.append(row | ({} if trial.landed else {"cause": trial.cause}))
-        write_file(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in rows).encode())
+        logs.write(path, rows, folder=folder)
 
 
 def flips(folder: str | Path, path: Path = FLIPS, *, jobs: int | None = None) -> None:
@@ -79,17 +78,17 @@ def flips(folder: str | Path, path: Path = FLIPS, *, jobs: int | None = None) ->
         for trial in run_trials(folder, FLIP_ROBOTS, FLIP_SEED, TrialSettings(engine=engine), jobs=jobs).trials:
             row = {"engine": engine, "number": trial.key.index, "landed": trial.landed}
             rows.append(row | ({} if trial.landed else {"cause": trial.cause}))
-    write_file(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in rows).encode())
+    logs.write(path, rows, folder=folder)
 
 
 def stored(path: Path = LOG) -> list[dict[str, Any]]:
     """The kept rows."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return logs.rows(path)
 
 
 def margins() -> dict[str, dict[str, MarginReport]]:
     """The kept margins of the default jump by engine and way: "usual", "robust", "one step", "feedback"."""
-    found = json.loads(Path(__file__).with_name("margins.json").read_text(encoding="utf-8"))
+    found = logs.table(Path(__file__).with_name("margins.json"))
     return {engine: {way: MarginReport.from_json(x) for way, x in told.items()} for engine, told in found.items()}
 
 

@@ -60,7 +60,7 @@ class SrmpSettings:
     touchdown_inertia: tuple[float, float] = (-0.3, 0.5)
     # the positive part of a crouch's depth is rounded over this much
     crouch_smoothing_m: float = 0.02
-    # SL-J1; the barbell's turn weighs more
+    # SL-J1: of the jerks of theta_l, phi, theta_pl, varphi, each in its usual size
     w_jerk: tuple[float, float, float, float] = (8e-5, 8e-5, 4e-4, 8e-4)
     w_posture_end: float = 1.0  # SL-J2 [1 / rad^2]
     w_velocity: float = 2.0  # SL-J2 [1 / (m/s)^2 / s]

@@ -152,6 +152,9 @@ class WholeBodyPlanner:
         """Solve for a target, from one start after the other, up to the first motion that keeps
         every limit.
 
+        Where nobody reads why there is no plan, :data:`jumplab.ocp.nlp.EXPLAINED` is off, and it
+        gives up sooner.
+
         Parameters
         ----------
         srmp : with tracking, stage 1's plan for the target.
@@ -161,9 +164,6 @@ class WholeBodyPlanner:
         stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's
             places; it if None.
         starts : instead of the usual list.
-
-        Where nobody reads why there is no plan, :data:`jumplab.ocp.nlp.EXPLAINED` is off, and it
-        gives up sooner.
 
         Raises
         ------

@@ -1,0 +1,163 @@
+"""Studies on file, and the code that made them: each row stands below a stamp, and what is older is shown as old."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import os
+import platform
+import tomllib
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jumplab
+from jumplab.io.files import open_log, write_file
+from jumplab.io.folder import PLAN, sha256, versions
+from jumplab.robot import Robot
+
+Row = dict[str, Any]
+# rooms whose code decides what a study finds; a reading, a picture or a command does not
+ROOMS = ("robot", "models", "ocp", "stages", "auditing", "control", "sim", "studies")
+STAMP = "stamp"
+
+
+# ---------------------------------------------------------------------------------------------- stamps
+
+
+@cache
+def code() -> dict[str, str]:
+    """Room of the library -> digest of what its sources do: comments, docstrings and layout do not count."""
+    root = Path(jumplab.__file__).parent
+    return {room: digest(sorted(p for p in (root / room).rglob("*") if p.suffix in (".py", ".toml"))) for room in ROOMS}
+
+
+def digest(paths: Iterable[Path]) -> str:
+    """Eight digits that change with the code of Python files, or with the values of TOML files."""
+    seen = hashlib.sha256()
+    for path in paths:
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".toml":
+            said = repr(tomllib.loads(text))
+        else:
+            said = ast.dump(_Bare().visit(ast.parse(text)))
+        seen.update(f"{path.name}\n{said}\n".encode())
+    return seen.hexdigest()[:8]
+
+
+class _Bare(ast.NodeTransformer):
+    """Leaves docstrings out."""
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
+            if isinstance(getattr(body[0].value, "value", None), str):
+                node.body = body[1:]
+        return super().generic_visit(node)
+
+
+def stamp(folder: str | Path | None = None, robot: Robot | None = None) -> Row:
+    """Who makes rows now: code, versions, machine; the plan of a result folder and a robot, where a study is of one."""
+    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    made = {"code": code(), "version": versions()["jumplab"], "machine": machine}
+    if folder is not None:
+        made["plan"] = sha256(Path(folder) / PLAN)[:12]
+    if robot is not None:
+        made["robot"] = f"{robot.name} {robot.hash}"
+    return made
+
+
+def age(stamps: Iterable[Mapping[str, Any] | None]) -> str:
+    """How many rows, each given by its stamp or None, are of the code of now, and what changed since the others."""
+    stamps = list(stamps)
+    unknown, old, changed = stamps.count(None), 0, Counter()
+    for made in filter(None, stamps):
+        rooms = [room for room, now in code().items() if made["code"].get(room) != now]
+        old += bool(rooms)
+        changed.update(rooms)
+    words = [f"{len(stamps) - old - unknown} of {len(stamps)} rows are of the code of now"]
+    if old:
+        rooms = [room for room in ROOMS if changed[room]]
+        words.append(f"{old} OLD, since when {', '.join(rooms)} changed")
+    if unknown:
+        words.append(f"{unknown} OLD, of code that put no stamp on them")
+    return "; ".join(words)
+
+
+# ---------------------------------------------------------------------------------------------- files
+
+
+def lines(path: Path) -> list[tuple[Row, Row | None]]:
+    """Rows of a log, each with the stamp above it, if there is one."""
+    found, made = [], None
+    for line in path.read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        if STAMP in row:
+            made = row[STAMP]
+        else:
+            found.append((row, made))
+    return found
+
+
+def rows(path: Path, say: Callable[[str], Any] = print) -> list[Row]:
+    """Rows of a log, after a line that says how old they are: every notebook that shows them has it."""
+    found = lines(path)
+    say(f"{path.name}: {age(made for _, made in found)}")
+    return [row for row, _ in found]
+
+
+@contextmanager
+def keep(path: Path, key: Callable[[Row], Hashable], **of: Any) -> Iterator[SimpleNamespace]:
+    """A log that can be stopped and started again: ``done`` (key -> row) and ``add(row)``, on the disk at once.
+
+    The stamp (of what :func:`stamp` takes) goes above the first row that is added.
+    """
+
+    def entry(line: Row) -> tuple[Hashable, Row]:
+        if STAMP in line:
+            raise ValueError("no row")
+        return key(line), line
+
+    with open_log(path, "study", entry) as log:
+        stamped = False
+
+        def add(row: Row) -> None:
+            nonlocal stamped
+            if not stamped:
+                log.add({STAMP: stamp(**of)})
+                stamped = True
+            log.add(row)
+            log.done[key(row)] = row
+
+        yield SimpleNamespace(done=log.done, add=add)
+
+
+def write(path: Path, found: Iterable[Row], **of: Any) -> None:
+    """A log as a whole, of a study that is made in one go."""
+    text = "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in ({STAMP: stamp(**of)}, *found))
+    write_file(path, text.encode())
+
+
+def table(path: Path, say: Callable[[str], Any] = print) -> Any:
+    """What :func:`write_table` has written, or a table without a stamp, after a line that says how old it is."""
+    found = json.loads(path.read_text(encoding="utf-8"))
+    made = found.get(STAMP) if isinstance(found, dict) else None
+    inner = found if made is None else found["table"]
+    say(f"{path.name}: {age([made] * len(inner))}")
+    return inner
+
+
+def write_table(path: Path, found: Any, **of: Any) -> None:
+    """A table of any shape as JSON, below a stamp."""
+    text = json.dumps({STAMP: stamp(**of), "table": found}, ensure_ascii=False, indent=1)
+    write_file(path, f"{text}\n".encode())
+
+
+if __name__ == "__main__":
+    for log in sorted(Path(__file__).parent.glob("*.json*")):
+        (rows if log.suffix == ".jsonl" else table)(log)

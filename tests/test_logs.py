@@ -1,0 +1,70 @@
+"""Studies on file carry the code that made them; rows of another code are shown as old."""
+
+import json
+
+import pytest
+from paper import logs
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """The code of now, which a test may change."""
+    code = {room: "00000000" for room in logs.ROOMS}
+    monkeypatch.setattr(logs, "code", lambda: dict(code))
+    return code
+
+
+def test_a_digest_changes_with_code_alone(tmp_path):
+    module, numbers = tmp_path / "a.py", tmp_path / "a.toml"
+    written = {
+        "as it is": ('"""Doc."""\n\n\ndef f(x):\n    """Doc."""\n    return x + 1\n', "a = 1  # one\n"),
+        "the same": ('"""Other."""\ndef f(x):  # new\n    return (x + 1)\n', "a=1\n"),
+        "a number": ('"""Doc."""\n\n\ndef f(x):\n    """Doc."""\n    return x + 2\n', "a = 1  # one\n"),
+        "a limit": ('"""Doc."""\n\n\ndef f(x):\n    """Doc."""\n    return x + 1\n', "a = 2  # one\n"),
+    }
+    found = {}
+    for name, (code, values) in written.items():
+        module.write_text(code)
+        numbers.write_text(values)
+        found[name] = logs.digest([module, numbers])
+    assert found["as it is"] == found["the same"] and len(set(found.values())) == 3, found
+    assert set(logs.code()) == set(logs.ROOMS) and len(set(logs.code().values())) == len(logs.ROOMS)
+
+
+def test_rows_of_other_code_are_told(tmp_path, now, bhr):
+    """A study that goes on after a change: each row belongs to the stamp above it."""
+    path, said = tmp_path / "log.jsonl", []
+    path.write_text('{"n": 0}\n')
+    for n, room in ((1, "sim"), (2, "stages"), (3, "stages")):
+        with logs.keep(path, lambda row: row["n"], robot=bhr) as log:
+            assert sorted(log.done) == list(range(n))
+            log.add({"n": n})
+        now[room] = f"0000000{n}"
+    now["stages"] = "00000002"
+    assert logs.rows(path, said.append) == [{"n": n} for n in range(4)]
+    assert said == [
+        "log.jsonl: 1 of 4 rows are of the code of now; 2 OLD, since when stages, sim changed; "
+        "1 OLD, of code that put no stamp on them"
+    ]
+    made = logs.lines(path)[-1][1]
+    assert made["robot"] == f"bhr {bhr.hash}" and made["code"]["sim"] == "00000001" and "cores" in made["machine"]
+    with logs.keep(path, lambda row: row["n"]):
+        pass
+    assert len(path.read_text().splitlines()) == 7  # nothing was added: no stamp either
+
+
+def test_whole_logs_and_tables(tmp_path, now):
+    said = []
+    (tmp_path / "plan.npz").write_bytes(b"tape")
+    logs.write(tmp_path / "a.jsonl", [{"n": 1}, {"n": 2}], folder=tmp_path)
+    logs.write_table(tmp_path / "b.json", {"bhr": 1})
+    (tmp_path / "c.json").write_text(json.dumps([1, 2, 3]))
+    assert logs.rows(tmp_path / "a.jsonl", said.append) == [{"n": 1}, {"n": 2}]
+    assert logs.lines(tmp_path / "a.jsonl")[0][1]["plan"] == logs.sha256(tmp_path / "plan.npz")[:12]
+    assert logs.table(tmp_path / "b.json", said.append) == {"bhr": 1}
+    assert logs.table(tmp_path / "c.json", said.append) == [1, 2, 3]
+    assert said == [
+        "a.jsonl: 2 of 2 rows are of the code of now",
+        "b.json: 1 of 1 rows are of the code of now",
+        "c.json: 0 of 3 rows are of the code of now; 3 OLD, of code that put no stamp on them",
+    ]
