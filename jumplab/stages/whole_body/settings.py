@@ -127,6 +127,9 @@ class Weights:
     jerk: float = 2e-7  # [1] / [rad/s^3]^2 / [s]
     torque: float = 2e-4  # [1] / [N m]^2 / [s]
     force: float = 1e-5  # [1] / [N]^2 / [s], of each corner's generators
+    # [1] / [rad]^2 / [s], of a waist and of arms above it, but for their swing: a waist at its stop
+    # can hold no trunk at touchdown, and bent it meets the thighs
+    posture: float = 30.0
     mirror: float = 10.0  # [1] / [rad]^2 / [s], of jumps straight ahead
     track_velocity: float = 200.0  # [1] / [m/s]^2 / [s]
     # inertia and momentum in shares of the stance's, so that weights mean the same for robots of

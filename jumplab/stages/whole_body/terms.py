@@ -55,6 +55,9 @@ def smoothness(m: Mode) -> list[Term]:
     w = m.weights
     origin = "WL-J2, WF-J2"
 
+    def bent(p):
+        return p.tree.q[m.body.upper] - ca.DM(m.body.stance[m.body.upper])
+
     def uneven(p):
         pairs = mirror(m.robot.model)
         rows = [p.q[BASE + k] - sign * p.q[BASE + i] for i, k, sign in pairs]
@@ -69,6 +72,9 @@ def smoothness(m: Mode) -> list[Term]:
         terms.append(
             Term("force", "ours: spread", "N", "node", lambda p: p.z[: m.n_forces], w.force)
         )
+    if m.body.upper:
+        straight = "ours: joints without a role stay near the stance"
+        terms.append(Term("waist and arms", straight, "rad", "node", bent, w.posture))
     if not (m.robot.planar or m.free.even):
         even = "ours: a jump straight ahead is even"
         terms.append(Term("mirror", even, "rad", "node", uneven, w.mirror))
