@@ -30,8 +30,8 @@ from jumplab.stages.planner import Planner
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trial
 from jumplab.task import JumpTask
 
-LOG = Path(__import__("os").environ.get("LOG", Path(__file__).with_name("acrobatics.jsonl")))
-ROBOT = __import__("os").environ.get("ROBOT", "g1_23")
+LOG = Path(__file__).with_name("acrobatics.jsonl")
+ROBOT = "g1_23"
 SEED = 42
 KINDS = "ahead", "side", "quarter turn", "half turn", "platform", "flip", "weaker"
 TARGETS = 14, 9, 9, 9, 9  # of the first kinds
