@@ -114,6 +114,11 @@ class Body:
         return [BASE - 1 + k for k, name in names if k not in legs and name not in roles]
 
     @property
+    def waist(self) -> list[int]:
+        """Those in the middle of the robot."""
+        return [k for k in self.upper if self.model.across[k - BASE + 1] is not None]
+
+    @property
     def short(self) -> bool:
         """Whether a leg has fewer than six joints: both feet on the ground then hold yaw and roll
         of the base.

@@ -53,6 +53,7 @@ class Limits:
     # [rad] the impact turns a straighter one too fast
     touchdown_knee: tuple[float, float] = (0.95, 1.4)
     touchdown_pitch: tuple[float, float] = (0.0, 0.30)  # [rad] of the base
+    touchdown_waist_rad: float = 0.15  # of each joint of a waist, off the stance either way
     # [rad] if set, least way left to the stop that the shank leans into
     touchdown_ankle_stroke: float | None = None
     # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
@@ -113,6 +114,7 @@ class Limits:
             momentum_share=0.15,  # stage 1's rod turns with other inertia than the body
             touchdown_trunk_rate=5.0,  # the trunk cannot stop while L stays what the turn needed
             touchdown_foot_rate=8.0,
+            touchdown_waist_rad=0.5,  # it opens with the legs
             # an ankle at its stop cannot keep a tilted robot's soles flat
             touchdown_ankle_stroke=0.12,
             capture_moment=0.047,

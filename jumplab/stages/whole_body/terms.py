@@ -427,9 +427,21 @@ def touchdown_rows(m: Mode) -> list[Term]:
         end("knees at touchdown", "ours: stroke", "rad", knees, *lim.touchdown_knee),
         end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.rates, -rate, rate),
         end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[free.turns], *trunk),
+        *upright_waist(m),
         *ankle_stroke(m),
         *capture_rows(m),
     ]
+
+
+def upright_waist(m: Mode) -> list[Term]:
+    """A waist is as in the stance, more or less: at its stop its motors cannot catch the trunk."""
+    columns = [k for k in m.body.waist if k in m.free.free]
+    if not columns:
+        return []
+    most = m.limits.touchdown_waist_rad
+    stance = ca.DM(m.body.stance[columns])
+    words = "waist at touchdown", "ours: stroke", "rad"
+    return [end(*words, lambda p: p.tree.q[columns] - stance, -most, most)]
 
 
 def end(
