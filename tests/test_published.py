@@ -23,6 +23,9 @@ from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Contacts
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.coordinates import even
+from jumplab.stages.whole_body.mode import Mode
+from jumplab.stages.whole_body.settings import Limits, Weights
+from jumplab.stages.whole_body.terms import smoothness, touchdown_rows
 from jumplab.task import JumpTask
 
 DOWNLOADED = [name for name, path in SHIPPED.items() if "robot_descriptions:" in path.read_text()]
@@ -104,9 +107,14 @@ def test_the_whole_g1_moves_evenly():
         tuple(f"left_{x}_joint" for x in ("ankle_pitch", "ankle_roll", "shoulder_pitch", "shoulder_roll", "elbow")),
     ]
     names = [body.model.names[k] for k in body.upper]
+    assert names[:3] == [body.model.names[k] for k in body.waist]
     assert (
         names[:3] == ["waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint"] and len(names) == 9 and not arms.upper
     )
+    for x, kept in ((body, {"waist and arms", "waist at touchdown"}), (arms, set())):
+        flight = Mode(x, Limits(), Weights(), "", even(x))
+        terms = {term.name for term in (*smoothness(flight), *touchdown_rows(flight))}
+        assert terms & {"waist and arms", "waist at touchdown"} == kept
 
 
 @here
