@@ -67,7 +67,11 @@ def targets() -> dict[str, list[dict[str, float]]]:
                 "side": {"distance_m": 0.0, "height_m": rise, "side_m": way * min(far, 0.3)},
                 "quarter turn": {"distance_m": far / 2, "height_m": rise, "yaw_rad": way * math.pi / 2},
                 "half turn": {"distance_m": 0.0, "height_m": max(rise, 0.2), "yaw_rad": way * math.pi},
-                "platform": {"distance_m": max(far, 0.3), "height_m": rise + 0.15, "platform_m": min(rise, 0.3)},
+                "platform": {
+                    "distance_m": max(far, 0.3),
+                    "height_m": round(rise + 0.15, 2),
+                    "platform_m": min(rise, 0.3),
+                },
             }
             asked[kind].append(found[kind])
     for turns, far in ((-1, 0.0), (1, 0.1)):
