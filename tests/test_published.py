@@ -21,6 +21,11 @@ from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import INSTALLED, Scene, simulate_jump
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Contacts
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.coordinates import even
+from jumplab.stages.whole_body.mode import Mode
+from jumplab.stages.whole_body.settings import Limits, Weights
+from jumplab.stages.whole_body.terms import smoothness, touchdown_rows
 from jumplab.task import JumpTask
 
 DOWNLOADED = [name for name, path in SHIPPED.items() if "robot_descriptions:" in path.read_text()]
@@ -71,7 +76,7 @@ def test_motors_of_the_g1_are_the_makers():
 
 @here
 @pytest.mark.slow
-@pytest.mark.parametrize("name, target", [("g1", (0.4, 0.2)), ("talos", (0.2, 0.05))])
+@pytest.mark.parametrize("name, target", [("g1", (0.4, 0.2)), ("g1_23", (0.3, 0.15)), ("talos", (0.2, 0.05))])
 def test_planned_clean_and_landed(name, target):
     robot = Robot.load(name)
     plan = Planner(robot).plan(JumpTask(*target))
@@ -84,6 +89,32 @@ def test_planned_clean_and_landed(name, target):
         assert result["landed"], result["reason"]
         assert result["foot_distance_m"] == pytest.approx(target[0], abs=place_m)
         assert result["com_rise_m"] == pytest.approx(target[1], abs=0.01)
+
+
+@here
+def test_the_whole_g1_moves_evenly():
+    """Waist and arms: half of the unknowns, and a cost that keeps those without a role near the stance; arms alone
+    have none.
+    """
+    body, arms = (Body(Robot.load(name)) for name in ("g1_23", "g1_arms"))
+    assert [even(x).free_names[-5:] for x in (body, arms)] == [
+        tuple(
+            [
+                "waist_pitch_joint",
+                *(f"left_{x}_joint" for x in ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow")),
+            ]
+        ),
+        tuple(f"left_{x}_joint" for x in ("ankle_pitch", "ankle_roll", "shoulder_pitch", "shoulder_roll", "elbow")),
+    ]
+    names = [body.model.names[k] for k in body.upper]
+    assert names[:3] == [body.model.names[k] for k in body.waist]
+    assert (
+        names[:3] == ["waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint"] and len(names) == 9 and not arms.upper
+    )
+    for x, kept in ((body, {"waist and arms", "waist at touchdown"}), (arms, set())):
+        flight = Mode(x, Limits(), Weights(), "", even(x))
+        terms = {term.name for term in (*smoothness(flight), *touchdown_rows(flight))}
+        assert terms & {"waist and arms", "waist at touchdown"} == kept
 
 
 @here

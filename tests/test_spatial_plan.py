@@ -279,7 +279,7 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_
     settled, finer, kept = (plan.solution for plan in plans)
     names = [[x.start for x in plan.attempts] for plan in plans]
     both = ["neighbour", "settled", "finer mesh"]
-    every = [*both, "finer mesh"]
+    every = [*both, "finer mesh", "finer mesh"]
     assert names == [["neighbour", "settled"], both, every + every]
     mesh = list(Mesh().intervals().values())
     assert [len(x.j) for x in settled.phases.values()] == mesh

@@ -93,7 +93,8 @@ class PositionServo:
     the base, the feet or another joint.
 
     Where a drive has no error it gives no torque, so the angle that is sent lies ahead of the
-    planned one by the planned torque over the stiffness, as far as the joint's range allows.
+    planned one by the planned torque over the stiffness, also beyond the joint's range: cut off
+    there, a joint near its stop would get too little torque.
     Stiffness is scaled by a motor's effort, damping by the stiffness, both within what a cycle of
     1 ms can hold on the joint's own inertia, that of the robot in its stance with all other joints
     free. ``late_s`` makes no difference here: the loop is closed in the drive. What is held for a
@@ -105,7 +106,6 @@ class PositionServo:
 
     def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
         motors = robot.limits
-        self._motors = motors
         self._late = (1 - 1 / substeps) / 2
         mass = pin.crba(robot.model, robot.model.createData(), stance_configuration(robot))
         inertia = 1 / np.diag(np.linalg.inv(mass))[6:]
@@ -118,8 +118,7 @@ class PositionServo:
         if command.q is None:
             return Drive(command.tau)
         ahead = command.q + (command.tau + self._late * command.change) / self.kp
-        target = np.minimum(np.maximum(ahead, self._motors.lower), self._motors.upper)
-        return Drive(self._none, target, command.rate, self.kp, self.kd)
+        return Drive(self._none, ahead, command.rate, self.kp, self.kd)
 
 
 class TorqueServo:

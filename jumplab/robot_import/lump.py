@@ -37,6 +37,7 @@ AXIS_RAD = 1e-4  # URDFs print a right angle as 1.5708; axes this close to x, y 
 ALIKE = 1e-6  # [m] and relative: as strict as the audit's idea of mirrored joints
 CAD_M = 0.005  # of places, and of a body's mass or inertia: what a CAD export leaves is evened out
 CAD_SHARE = 0.01
+LIGHT = 0.02  # of the robot's mass: in a lighter body differences count by as much less
 PAIR_M = 0.10  # farther apart two joints are no counterparts
 SAME = 0.98  # cosine between a joint's axis and the mirror image of its counterpart's
 
@@ -357,6 +358,7 @@ def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
     evened = dict(moved)
     gaps = []  # [m]
     shares = []  # [1]
+    light = LIGHT * sum(body.inertia.mass for body in bodies)
     for name, image in images.items():
         body = moved[name]
         other = moved[image]
@@ -366,8 +368,9 @@ def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
         one, two = (x.inertia.toPseudoInertia().toMatrix() for x in (body, other))
         mean = (one + IMAGE * two) / 2
         apart = np.abs(one - IMAGE * two)
-        shares.append(apart[3, 3] / mean[3, 3])
-        shares.append(apart[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12))
+        counts = min(1.0, mean[3, 3] / light)
+        shares.append(counts * apart[3, 3] / mean[3, 3])
+        shares.append(counts * apart[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12))
         axis = MIRROR * other.axis * np.sign(MIRROR * other.axis @ body.axis)
         left = body.place[1] >= other.place[1]
         evened[name] = replace(

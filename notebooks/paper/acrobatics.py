@@ -1,140 +1,209 @@
-"""What a G1 can do within its motors' curves, and by how much they forbid the rest: the rows of ``acrobatics.json``.
+"""What a G1 can do within its maker's motor curves: the rows of ``acrobatics.jsonl``.
 
-``python -m paper.acrobatics`` in the folder of the notebooks plans every jump of :data:`ASKED` that has no row yet;
-those that are planned clean are played back in both engines, those on file in mode "whole-body". Notebook 07 prints
-the rows.
+``python -m paper.acrobatics [KIND ...]`` in the folder of the notebooks plans and audits what :data:`ASKED` has and the
+log lacks, plays each clean plan back in both engines, and can be stopped and started again; ``python -m
+paper.acrobatics table`` prints the counts. Notebook 07 prints the rows.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 import time
 from functools import cache
+from itertools import chain, repeat, zip_longest
+from operator import itemgetter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from jumplab import api
+from jumplab.auditing import AuditReport
 from jumplab.errors import JumplabError
 from jumplab.robot import Robot
-from jumplab.sim import INSTALLED
+from jumplab.show.tables import Table, table
+from jumplab.sim import INSTALLED, Scene
 from jumplab.stages.planner import Planner
+from jumplab.studies.trials import TrialKey, TrialSettings, run_trial
 from jumplab.task import JumpTask
 from paper import logs
 
-TABLE = Path(__file__).with_name("acrobatics.json")
-# robot, factors on efforts and on speeds of all motors, distance, rise, platform [m], turns about +y, method
-Asked = tuple[str, float, float, float, float, float, int, str]
-KEYS = "robot", "effort", "speed", "distance_m", "height_m", "platform_m", "turns", "method"
-FARTHEST = {"Farthest": "distance_m", "Highest platform": "platform_m", "Highest": "height_m"}
-ASKED: list[Asked] = [
-    ("g1", 1.0, 1.0, 0.6, 0.3, 0.0, 0, "direct"),
-    ("g1", 1.0, 1.0, 0.5, 0.35, 0.2, 0, "direct"),
-    ("g1", 1.0, 1.0, 0.9, 0.3, 0.0, 0, "direct"),
-    ("g1", 1.0, 1.0, 0.7, 0.4, 0.0, 0, "direct"),
-    ("g1", 1.0, 1.0, 0.5, 0.45, 0.3, 0, "direct"),
-    ("g1", 1.0, 1.0, 0.2, 0.27, 0.0, 1, "direct"),
-    ("g1", 1.0, 1.0, 0.0, 0.35, 0.0, -1, "direct"),
-    ("g1", 1.0, 1.0, 0.0, 0.35, 0.0, -1, "three-step"),
-    ("g1", 1.0, 2.0, 0.0, 0.35, 0.0, -1, "direct"),
-    ("g1", 2.0, 1.0, 0.0, 0.35, 0.0, -1, "direct"),
-    ("g1", 2.0, 2.0, 0.0, 0.35, 0.0, -1, "direct"),
-]
+LOG = Path(__file__).with_name("acrobatics.jsonl")
+ROBOT = "g1_23"
+SEED = 42
+KINDS = "ahead", "side", "quarter turn", "half turn", "platform", "flip", "weaker"
+TARGETS = 14, 9, 9, 9, 9  # of the first kinds
+FAR = 3.0  # times the rise, the farthest that is asked: shallower jumps slip
+PERTURBED = 100  # robots, of each flip in :data:`THROWN`
+THROWN = ("backflip, 0 m ahead, 0.4 m up", "front flip, 0.1 m ahead, 0.4 m up")
+COLUMNS = {
+    "kind": "kind",
+    "asked": "targets",
+    "planned": "planned",
+    "clean": "audit passed",
+    "landed": "landed in both engines",
+    "cpu_s": "CPU of a plan, median [s]",
+    "iterations": "iterations, median",
+}
 
 
-def rows() -> list[dict[str, Any]]:
-    """The table: what was asked, what became of the plan, which limit it uses most, and how it landed."""
-    return logs.table(TABLE)
+def targets() -> dict[str, list[dict[str, float]]]:
+    """Kind -> fields of :class:`.JumpTask`; where motors are weaker, also factors ``effort`` and ``speed``."""
+    rng = np.random.default_rng(SEED)
+
+    def drawn(low: float, high: float) -> float:
+        return round(float(rng.uniform(low, high)), 2)
+
+    asked: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
+    for kind, number in zip(KINDS, TARGETS, strict=False):
+        for k in range(number):
+            rise = drawn(0.1, 0.35)  # onto a platform that high, at most 0.3 m, by 0.15 m more
+            far = drawn(0.1, min(0.9, FAR * rise))
+            way = 1.0 if k % 2 else -1.0
+            found = {
+                "ahead": {"distance_m": far, "height_m": rise},
+                "side": {"distance_m": 0.0, "height_m": rise, "side_m": way * min(far, 0.3)},
+                "quarter turn": {"distance_m": far / 2, "height_m": rise, "yaw_rad": way * math.pi / 2},
+                "half turn": {"distance_m": 0.0, "height_m": max(rise, 0.2), "yaw_rad": way * math.pi},
+                "platform": {
+                    "distance_m": max(far, 0.3),
+                    "height_m": round(rise + 0.15, 2),
+                    "platform_m": min(rise, 0.3),
+                },
+            }
+            asked[kind].append(found[kind])
+    for turns, far in ((-1, 0.0), (1, 0.1)):
+        over = {"rotation_rad": turns * 2 * math.pi, "distance_m": far}
+        asked["flip"] += [over | {"height_m": rise} for rise in (0.3, 0.35, 0.4, 0.45, 0.5)]
+        asked["weaker"] += [
+            over | {"height_m": rise, "effort": share, "speed": share}
+            for rise in (0.3, 0.4, 0.5)
+            for share in (0.95, 0.9, 0.85, 0.8)
+        ]
+    return asked
+
+
+def key(kind: str, target: dict[str, float]) -> str:
+    """The name of a row in the log."""
+    return f"{kind}: " + json.dumps(target, sort_keys=True)
 
 
 @cache
-def planner(name: str, effort: float, speed: float) -> Planner:
+def planner(effort: float, speed: float) -> Planner:
     """Of a robot with motors that are stronger, and faster, by factors."""
-    robot = Robot.load(name)
-    return Planner(robot if effort == speed == 1 else robot.with_limits(effort=effort, speed=speed))
+    robot = Robot.load(ROBOT)
+    return Planner(robot if effort == speed == 1 else robot.with_limits(effort=effort, speed=speed), keep=True)
 
 
-def attempt(asked: Asked) -> dict[str, Any]:
-    """One row: the plan, its audit, and, where that is clean, its simulations."""
-    name, effort, speed, distance, height, platform, turns, method = asked
-    row: dict[str, Any] = dict(zip(KEYS, asked, strict=True))
-    task = JumpTask(distance, height, platform_m=platform, rotation_rad=2 * math.pi * turns)
+def attempt(kind: str, target: dict[str, float]) -> dict[str, Any]:
+    """One row: the plan, its audit, and, where that is clean, its simulations and those of robots that differ."""
+    task = dict(target)
+    factors = task.pop("effort", 1.0), task.pop("speed", 1.0)
+    row: dict[str, Any] = {"kind": kind, **target, "effort": factors[0], "speed": factors[1]}
+    row |= {"planned": False, "clean": False, "said": ""}
     start = time.process_time()
     try:
-        plan = planner(name, effort, speed).plan(task, method=method)
+        plan = planner(*factors).plan(JumpTask(**task))
     except JumplabError as e:
-        return row | {"clean": False, "said": str(e), "cpu_s": round(time.process_time() - start, 1)}
+        return row | {"said": str(e), "cpu_s": round(time.process_time() - start, 2)}
+    attempts = plan.whole_body.attempts
+    row |= {"planned": True, "cpu_s": round(time.process_time() - start, 2)}
+    row |= {"solve_s": round(sum(x.cpu_s for x in attempts), 2), "iterations": sum(x.iterations for x in attempts)}
     report = api.audit(plan)
-    used = max((c for c in report.checks if c.group == "joints" and c.unit.startswith("%")), key=lambda c: c.value)
-    failed = [f"{c.name}: {c.value:.3g} {c.unit}, at most {c.limit:g}" for c in report.checks if not c.passed]
-    row |= {"clean": report.passed, "said": "; ".join(failed), "cpu_s": round(time.process_time() - start, 1)}
-    row |= {"used": [used.name, round(used.value, 1), used.note.rpartition("worst: ")[2]]}
-    if report.passed:
-        row["landed"] = {engine: _landing(plan, engine) for engine in INSTALLED}
+    row |= {"clean": report.passed, "used": fullest(report)}
+    row["said"] = "; ".join(f"{c.name}: {c.value:.3g} {c.unit}, at most {c.limit:g}" for c in report.failed)
+    if report.passed and kind != "weaker":
+        row["landed"] = {engine: landing(plan, engine) for engine in INSTALLED}
+    if kind == "flip" and report.passed and named(row) in THROWN:
+        row["perturbed"] = {engine: thrown(plan, engine) for engine in INSTALLED}
     return row
 
 
-def _landing(plan: Any, engine: str) -> list[Any]:
+def fullest(report: AuditReport) -> list[Any]:
+    """The limit of the joints that is used most: name, share [%], joint."""
+    used = max((c for c in report.checks if c.group == "joints" and c.unit.startswith("%")), key=lambda c: c.value)
+    return [used.name, round(used.value, 1), used.note.rpartition("worst: ")[2]]
+
+
+def landing(plan: Any, engine: str) -> list[Any]:
     """Whether a playback landed and its findings passed, distance and rise [m], and why it ended."""
     run = api.simulate(plan, engine=engine)
-    sound = run.landed and all(finding.passed for finding in run.checks)
     far, high = run.metrics.foot_distance_m, run.metrics.com_rise_m
-    return [sound, far and round(far, 3), high and round(high, 3), run.reason]
+    return [run.landed and run.checks_passed, far and round(far, 3), high and round(high, 3), run.reason]
 
 
-def named(row: dict[str, Any]) -> str:
-    """A jump in words."""
-    turn = {-1: "backflip, ", 0: "", 1: "front flip, "}[row["turns"]]
-    step = f", onto {row['platform_m']:g} m" if row["platform_m"] else ""
-    way = f"{row['distance_m']:g} m ahead, " if row["distance_m"] else ""
-    return f"{turn}{way}{row['height_m']:g} m up{step}"
+def thrown(plan: Any, engine: str) -> list[bool]:
+    """Of :data:`PERTURBED` robots that differ from their model, whether each one lands."""
+    settings = TrialSettings(engine=engine)
+    there = SimpleNamespace(tape=plan.tape, robot=plan.robot, scene=Scene.flat())
+    keys = (TrialKey(0, k, settings.hash, "") for k in range(PERTURBED))
+    return [run_trial(there, settings, k).landed for k in keys]
 
 
-def verdicts(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line per row: what was asked of which motors, and what became of it."""
+# what the log says
+# ---------------------------------------------------------------------------------------------------------------------
+def rows() -> list[dict[str, Any]]:
+    """The log: what was asked, what became of the plan, which limit it uses most, and how it landed."""
+    return [line["row"] for line in logs.rows(LOG)]
+
+
+def lands(row: dict[str, Any]) -> bool:
+    """Whether a plan is clean and lands in every engine that was asked."""
+    return row["clean"] and all(found[0] for found in row["landed"].values())
+
+
+def counts(found: list[dict[str, Any]]) -> Table:
+    """A row per kind of jump with the motors as made."""
     out = []
-    for row in found:
-        landed = list(row.get("landed", {}).values())
-        name, share, joint = row.get("used", ("", 0.0, ""))
-        fullest = f"{name}, {share:.0f} %, {joint}" if name else ""
-        line = {
-            "robot": row["robot"],
-            "jump": named(row),
-            "motors": motors(row),
-        }
-        line |= {"plan": "clean" if row["clean"] else row["said"].split(";")[0], "fullest limit": fullest}
-        out.append(line | {"lands": f"{sum(x[0] for x in landed)} of {len(landed)}" if landed else ""})
+    for kind in KINDS[:-1]:
+        some = [row for row in found if row["kind"] == kind]
+        planned = [row for row in some if row["planned"]]
+        line = {"kind": kind, "asked": len(some), "planned": len(planned)}
+        line |= {"clean": sum(row["clean"] for row in some), "landed": sum(map(lands, some))}
+        medians = {k: float(np.median([row[k] for row in planned])) for k in ("cpu_s", "iterations") if planned}
+        out.append(line | medians)
+    return table(out, COLUMNS)
+
+
+def flips(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line per flip: its plan, its fullest limit, how it lands, and with how much weaker motors it has a plan."""
+    out = []
+    weaker = [row for row in found if row["kind"] == "weaker"]
+    for row in (row for row in found if row["kind"] == "flip"):
+        same = [x for x in weaker if x["clean"] and named(x) == named(row)]
+        asked = any(named(x) == named(row) for x in weaker)
+        least = f"{min([x['effort'] for x in same], default=1.0):.0%}" if asked else ""
+        line = {"flip": named(row), "plan": "clean" if row["clean"] else row["said"].split(";")[0]}
+        line["fullest limit"] = "{}, {:.0f} %, {}".format(*row["used"]) if "used" in row else ""
+        line["lands"] = f"{sum(x[0] for x in row['landed'].values())} of {len(row['landed'])}" if row["clean"] else ""
+        thrown = [sum(x) for x in row.get("perturbed", {}).values()]
+        line["of robots that differ"] = ", ".join(f"{n} of {PERTURBED}" for n in thrown)
+        out.append(line | {"also clean with motors of": least})
     return out
 
 
-def motors(row: dict[str, Any]) -> str:
-    """What was asked of them, in words."""
-    changed = [f"{name} x {row[name]:g}" for name in ("effort", "speed") if row[name] != 1]
-    return ", ".join(changed) or "as made"
+def named(row: dict[str, Any]) -> str:
+    """A flip in words."""
+    turn = "front flip" if row["rotation_rad"] > 0 else "backflip"
+    return f"{turn}, {row['distance_m']:g} m ahead, {row['height_m']:g} m up"
 
 
-def told(found: list[dict[str, Any]]) -> list[str]:
-    """What the table says: the farthest jump and the highest platform, and of each flip which motors do it, and by how
-    much those that do not fall short."""
-    sound = [row for row in found if row["clean"] and all(landing[0] for landing in row["landed"].values())]
-    made = [row for row in sound if motors(row) == "as made" and not row["turns"]]
-    lines = [f"{what}: {named(max(made, key=lambda row, key=key: row[key]))}" for what, key in FARTHEST.items() if made]
-    for turns in (-1, 1):
-        for row in (row for row in found if row["turns"] == turns):
-            short = row["said"].partition("): ")[2].partition("; they leave")[0]
-            became = "lands" if row in sound else short or row["said"] or "does not land"
-            lines.append(f"{named(row)}, {row['method']}, motors {motors(row)}: {became}")
-    return [line[0].upper() + line[1:] for line in lines]
-
-
-def main() -> None:
-    """Fill the table."""
-    done = rows() if TABLE.exists() else []
-    for asked in ASKED:
-        if not any(all(row[k] == x for k, x in zip(KEYS, asked, strict=True)) for row in done):
-            done.append(attempt(asked))
-            logs.write_table(TABLE, done)
-            print(*asked, done[-1]["clean"], done[-1]["said"], done[-1].get("landed"), flush=True)
+def main(*kinds: str) -> None:
+    """Do what is missing, or print the counts."""
+    if kinds == ("table",):
+        print(counts(rows()))
+        return
+    with logs.keep(LOG, itemgetter("key")) as log:
+        asked = [[(kind, target) for target in some] for kind, some in targets().items() if kind in (kinds or KINDS)]
+        for kind, target in chain.from_iterable(map(filter, repeat(None), zip_longest(*asked))):  # some of each
+            if (name := key(kind, target)) not in log.done:
+                row = attempt(kind, target)
+                log.add({"key": name, "row": row})
+                print(name, row["clean"], row["said"][:200], row.get("landed"), row["cpu_s"], flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -101,6 +101,23 @@ class Body:
             for name, sign in zip(names, signs, strict=False)
         ]
 
+    @cached_property
+    def upper(self) -> list[int]:
+        """Columns of the chart of the joints above a waist that have no role, and the waist's own;
+        of a robot without a waist, none.
+        """
+        if not any(self.model.across[1:]):
+            return []
+        roles = {name for pair in self.robot.joints.values() for name in pair}
+        legs = {body for foot in self.feet for body in self.chain(foot)}
+        names = enumerate(self.joint_names, 1)
+        return [BASE - 1 + k for k, name in names if k not in legs and name not in roles]
+
+    @property
+    def waist(self) -> list[int]:
+        """Those in the middle of the robot."""
+        return [k for k in self.upper if self.model.across[k - BASE + 1] is not None]
+
     @property
     def short(self) -> bool:
         """Whether a leg has fewer than six joints: both feet on the ground then hold yaw and roll

@@ -54,6 +54,7 @@ class Limits:
     # [rad] the impact turns a straighter one too fast
     touchdown_knee: tuple[float, float] = (0.95, 1.4)
     touchdown_pitch: tuple[float, float] = (0.0, 0.30)  # [rad] of the base
+    touchdown_waist_rad: float = 0.15  # of each joint of a waist, off the stance either way
     # [rad] if set, least way left to the stop that the shank leans into
     touchdown_ankle_stroke: float | None = None
     # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
@@ -120,6 +121,7 @@ class Limits:
             momentum_share=0.15,  # stage 1's rod turns with other inertia than the body
             touchdown_trunk_rate=5.0,  # the trunk cannot stop while L stays what the turn needed
             touchdown_foot_rate=8.0,
+            touchdown_waist_rad=0.5,  # it opens with the legs
             # an ankle at its stop cannot keep a tilted robot's soles flat
             touchdown_ankle_stroke=0.12,
             capture_moment=0.047,
@@ -134,6 +136,9 @@ class Weights:
     jerk: float = 2e-7  # [1] / [rad/s^3]^2 / [s]
     torque: float = 2e-4  # [1] / [N m]^2 / [s]
     force: float = 1e-5  # [1] / [N]^2 / [s], of each corner's generators
+    # [1] / [rad]^2 / [s], of a waist and of arms above it, but for their swing: a waist at its stop
+    # can hold no trunk at touchdown, and bent it meets the thighs
+    posture: float = 30.0
     mirror: float = 10.0  # [1] / [rad]^2 / [s], of jumps straight ahead
     track_velocity: float = 200.0  # [1] / [m/s]^2 / [s]
     # inertia and momentum in shares of the stance's, so that weights mean the same for robots of

@@ -244,4 +244,4 @@ SEEKING = Start("easy jump", from_neighbour, False, 300, WARM | EXACT | FAR_OFF)
 RECORD = Start("record", from_neighbour, False, 150, WARM | EXACT | {"mu_init": 1e-4})
 SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
 FINER = Start("finer mesh", from_neighbour, False, 150, WARM | {"acceptable_iter": 1})
-REFINED = (SETTLED, FINER, FINER)
+REFINED = (SETTLED, FINER, FINER, FINER)  # the last one for flips of robots with a waist

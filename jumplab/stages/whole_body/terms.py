@@ -55,6 +55,9 @@ def smoothness(m: Mode) -> list[Term]:
     w = m.weights
     origin = "WL-J2, WF-J2"
 
+    def bent(p):
+        return p.tree.q[m.body.upper] - ca.DM(m.body.stance[m.body.upper])
+
     def uneven(p):
         pairs = mirror(m.robot.model)
         rows = [p.q[BASE + k] - sign * p.q[BASE + i] for i, k, sign in pairs]
@@ -69,6 +72,9 @@ def smoothness(m: Mode) -> list[Term]:
         terms.append(
             Term("force", "ours: spread", "N", "node", lambda p: p.z[: m.n_forces], w.force)
         )
+    if m.body.upper:
+        straight = "ours: joints without a role stay near the stance"
+        terms.append(Term("waist and arms", straight, "rad", "node", bent, w.posture))
     if not (m.robot.planar or m.free.even):
         even = "ours: a jump straight ahead is even"
         terms.append(Term("mirror", even, "rad", "node", uneven, w.mirror))
@@ -421,9 +427,21 @@ def touchdown_rows(m: Mode) -> list[Term]:
         end("knees at touchdown", "ours: stroke", "rad", knees, *lim.touchdown_knee),
         end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.rates, -rate, rate),
         end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[free.turns], *trunk),
+        *upright_waist(m),
         *ankle_stroke(m),
         *capture_rows(m),
     ]
+
+
+def upright_waist(m: Mode) -> list[Term]:
+    """A waist is as in the stance, more or less: at its stop its motors cannot catch the trunk."""
+    columns = [k for k in m.body.waist if k in m.free.free]
+    if not columns:
+        return []
+    most = m.limits.touchdown_waist_rad
+    stance = ca.DM(m.body.stance[columns])
+    words = "waist at touchdown", "ours: stroke", "rad"
+    return [end(*words, lambda p: p.tree.q[columns] - stance, -most, most)]
 
 
 def end(
