@@ -23,7 +23,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.sagittal import rotated
 from jumplab.robot.stance import stance_angles, stance_configuration
-from jumplab.show.shapes import rounded_boxes
+from jumplab.show.shapes import rounded_body
 from jumplab.show.style import (
     FLIGHT,
     GROUND,
@@ -71,7 +71,7 @@ class Silhouette:
         self._axes = VIEWS[view]
         self._data = robot.model.createData()
         pin.forwardKinematics(self._model, self._data, pin.neutral(self._model))
-        parts = rounded_boxes(robot)
+        parts = rounded_body(robot)
         left = [self._data.oMi[p.joint].act(p.points.mean(axis=0))[1] for p in parts]
         if view == "side":  # far ones first
             parts = [parts[k] for k in np.argsort(left, kind="stable")]
