@@ -38,7 +38,7 @@ from jumplab.show.style import (
     bare,
     new_figure,
     shade,
-    styled,
+    themed,
     tint,
 )
 
@@ -246,7 +246,7 @@ def equal_scales(ax: Axes) -> None:
 # the sheet of a robot
 # ----------------------------------------------------------------------------------------------
 @checked
-@styled
+@themed
 def robot_sheet(robot: Robot) -> Figure:
     """A robot standing, its moving joints with their roles from the front, and its five links."""
     fig = new_figure(PAGE_IN, 3.0)

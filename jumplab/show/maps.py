@@ -22,7 +22,7 @@ from jumplab.show.style import (
     LAUNCH,
     PAGE_IN,
     new_figure,
-    styled,
+    themed,
     tint,
 )
 from jumplab.studies.envelope import BEYOND, OPEN, Envelope
@@ -47,7 +47,7 @@ RADAR_WIDTHS = 4.0, 2.6, 0.8, 1.6  # equal lines show below each other
 
 
 @checked
-@styled
+@themed
 def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
     """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much
     of it.
@@ -108,7 +108,7 @@ def _draw_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: s
 
 
 @checked
-@styled
+@themed
 def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     """How much of each disturbance plans bear, as a share of the largest that is tried: plain, and
     re-aimed.

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Sequence
+from contextlib import ContextDecorator, ExitStack
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import rc_context, rc_params_from_file, rcParams, rcParamsDefault
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import is_color_like, to_rgb
@@ -50,6 +52,9 @@ LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}  # a bound
 BAND = (0.928, 0.928, 0.928)  # fill of what is allowed between two bounds
 # keywords of Axes.annotate
 NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}
+# of the style, in points: they grow with a font.size of the user's
+TEXT_SIZES = [f"{of}.labelsize" for of in ("axes", "xtick", "ytick")]
+TEXT_SIZES += ["axes.titlesize", "legend.fontsize"]
 STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
 
 
@@ -59,8 +64,40 @@ def use_style() -> None:
     show_waiting()
 
 
-# decorator or ``with`` block: the style, whatever the caller's settings are
-styled = plt.style.context(STYLE_FILE)
+class Style(ContextDecorator):
+    """The style, as a decorator or in a ``with`` block.
+
+    ``whole`` whatever the caller's settings are, else with those that differ from Matplotlib's
+    defaults left as they are.
+    """
+
+    def __init__(self, whole: bool):
+        self._whole = whole
+        self._open: list[ExitStack] = []
+
+    def __enter__(self) -> None:
+        own = {} if self._whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
+        stack = ExitStack()
+        stack.enter_context(plt.style.context(STYLE_FILE))
+        larger = own.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
+        for key in (key for key in TEXT_SIZES if key not in own):
+            rcParams[key] *= larger
+        rcParams.update(own)
+        self._open.append(stack)
+
+    def __exit__(self, *exc: Any) -> None:
+        self._open.pop().close()
+
+
+def _ours() -> dict[str, Any]:
+    """Values now of the settings that the style has."""
+    return {
+        key: rcParams[key] for key in rc_params_from_file(STYLE_FILE, use_default_template=False)
+    }
+
+
+styled = Style(whole=True)
+themed = Style(whole=False)  # for pictures of results: the user's style wins
 
 
 class Picture(Figure):
@@ -68,7 +105,10 @@ class Picture(Figure):
 
     _saved = b""  # its PNG, see save_figure
 
-    @styled
+    def __init__(self, *args: Any, **options: Any):
+        super().__init__(*args, **options)
+        self.settings = _ours()  # under which it is drawn later too
+
     def _repr_png_(self) -> bytes:
         if self._saved and not self.stale:
             return self._saved
@@ -78,12 +118,13 @@ class Picture(Figure):
 def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
     """A figure as a file of that kind; ``how`` are options of ``Figure.savefig``."""
     buffer = io.BytesIO()
-    fig.savefig(buffer, format=kind, **how)
+    with styled, rc_context(getattr(fig, "settings", {})):
+        fig.savefig(buffer, format=kind, **how)
     return buffer.getvalue()
 
 
 @checked
-@styled
+@themed
 def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
     """An empty figure of the style, ``width`` and ``height`` [in]."""
     if not (0 < width < PAGE_MOST_IN and 0 < height < PAGE_MOST_IN):
@@ -201,7 +242,6 @@ def bare(ax: Axes) -> None:
 # saving
 # ----------------------------------------------------------------------------------------------
 @checked
-@styled
 def save_figure(
     fig: Figure,
     name: str,
