@@ -126,7 +126,7 @@ def judge(
     motion: Any, robot: Robot | str | Path = "bhr", **reading: Any
 ) -> ClipReport | list[ClipReport]:
     """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
-    fall, forces from nowhere, motors, joints, collisions.
+    fall, unphysical forces, motors, joints, collisions.
 
     Parameters
     ----------
