@@ -70,7 +70,7 @@ IGNORED = [
      "nor --runs asks for one; leave it away"),
     ("sweep --out x --cluster tcp://a:1 --jobs 2", "--jobs is for processes of this machine, and --cluster does the "
      "work elsewhere; leave it away"),
-    ("robot check g1 --repair inertia", "--repair is for a bare URDF; a configuration says itself what is repaired, "
+    ("robot check g1 --repair inertia", "--repair is for a bare URDF; a configuration has its own [source] repair, "
      "so leave it away"),
 ]  # fmt: skip
 

@@ -120,7 +120,7 @@ def test_failing_notebook_stops_the_chain(tmp_path, cell, kind, sentence):
     [
         (
             {"distance": 1.0},
-            "unknown notebook parameter 'distance'; the notebooks know distance_m, figures, height_m, n, out, robot",
+            "unknown notebook parameter 'distance'; the notebooks have distance_m, figures, height_m, n, out, robot",
         ),
         ({"out": "x"}, "the parameter 'out' is set by the runner; use its own argument out"),
         ({"distance_m": "far"}, "parameter distance_m must be a number, got 'far'"),

@@ -117,7 +117,7 @@ def test_servos_tell_no_torque_but_by_their_force_range(put):
     servo = '<position joint="left_knee" kp="100" ctrlrange="-2 2" {}/>'
     path = put(changed(MJCF, (KNEE, servo.format(""))), "a.xml")
     assert limit(path, "left_knee") is None
-    assert any("tell effort, velocity in [limits.left_knee]" in sentence for sentence in draft(path).faults)
+    assert any("give effort, velocity in [limits.left_knee]" in sentence for sentence in draft(path).faults)
     path = put(changed(MJCF, (KNEE, servo.format('forcerange="-50 80"'))), "a.xml")
     assert limit(path, "left_knee") == 50
     frames = ('<joint name="left_knee"', '<joint actuatorfrcrange="-30 40" name="left_knee"')

@@ -66,7 +66,7 @@ def test_columns_have_names(plan):
 
 def test_logs_without_a_robot_say_how_to_get_one(plan):
     logs = SimulationResult(**dict.fromkeys([f for f in SimulationResult.__dataclass_fields__ if f != "robot"]))
-    with pytest.raises(InputError, match=r"^these logs do not know their robot; read them with jl\.load$"):
+    with pytest.raises(InputError, match=r"^the robot of these logs is unknown; read them with jl\.load$"):
         _ = logs.torque
 
 

@@ -371,7 +371,7 @@ def test_margins_of_other_ways_and_their_picture(folder, monkeypatch):
         assert [line.get_label() for line in ax.lines] == ["usual", "one step"]
         assert [text.get_text() for text in ax.get_xticklabels()] == ["payload_kg"]  # what both tell
     assert not margin_radar(usual).legends and len(figure.legends) == 1
-    with pytest.raises(InputError, match="up to 4 reports and what two of them tell, got 5 reports with 1 dist"):
+    with pytest.raises(InputError, match="up to 4 reports with disturbances in two of them, got 5 reports with 1 dist"):
         margin_radar({str(k): usual for k in range(5)})
 
 

@@ -59,7 +59,7 @@ def check_parameters(namespace: Mapping[str, Any]) -> None:
             for name in re.findall(r"^(\w+) = ", injected, re.M):
                 if name not in known:
                     raise InputError(
-                        f"unknown notebook parameter {name!r}; this notebook knows "
+                        f"unknown notebook parameter {name!r}; this notebook has "
                         f"{', '.join(known)}"
                     )
         for name, kind in known.items():
@@ -232,7 +232,7 @@ def _checked(values: dict[str, Any], declared: Iterable[Kinds]) -> dict[str, Any
             )
         if name not in known:
             raise InputError(
-                f"unknown notebook parameter {name!r}; the notebooks know {', '.join(known)}"
+                f"unknown notebook parameter {name!r}; the notebooks have {', '.join(known)}"
             )
         for kinds in declared:
             check_value(name, value, kinds.get(name))

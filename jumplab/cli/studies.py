@@ -325,7 +325,7 @@ def sweep(args: Namespace) -> None:
     table = Path(args.out, studies.sweep.TABLE)
     args.found |= {"table": table, "rows": rows}
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
-    outcome = f"{planned} planned, {clean} of them clean in the audit"
+    outcome = f"{planned} planned, {clean} passed the audit"
     print(f"{len(rows)} cases, {outcome}; table in {table}")
 
 

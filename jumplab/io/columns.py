@@ -99,7 +99,7 @@ class Named:
 
     def _columns(self, values: np.ndarray, unit: str) -> Columns:
         if self.robot is None:
-            raise InputError("these logs do not know their robot; read them with jl.load")
+            raise InputError("the robot of these logs is unknown; read them with jl.load")
         return Columns(values, self.robot, unit)
 
     @property

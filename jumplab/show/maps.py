@@ -124,8 +124,8 @@ def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     counts = Counter(m.names for report in several.values() for m in report.margins if m.reaim)
     names = [name for name, count in counts.items() if count > 1 or len(several) == 1]
     if not names or len(several) > len(RADAR_COLORS):
-        given = f"{len(several)} reports with {len(names)} disturbances that two of them tell"
-        most = f"up to {len(RADAR_COLORS)} reports and what two of them tell"
+        given = f"{len(several)} reports with {len(names)} disturbances in two of them"
+        most = f"up to {len(RADAR_COLORS)} reports with disturbances in two of them"
         raise InputError(f"the radar shows {most}, got {given}")
     fig = new_figure(PAGE_IN, 3.8)
     angles = np.linspace(0, 2 * np.pi, len(names) + 1)  # the first again, so that lines close

@@ -149,7 +149,7 @@ def shade(color: Color, share: float) -> tuple[float, float, float]:
 def _mixed(color: Color, share: float) -> tuple[float, float, float]:
     """(r, g, b) of a color of which there is to be a ``share``."""
     if not is_color_like(color):
-        raise InputError(f"color {quoted(color)}: Matplotlib knows none such")
+        raise InputError(f"color {quoted(color)}: Matplotlib has no such color")
     if not 0 <= share <= 1:
         raise InputError(f"a share of {share:g} of a color is outside 0 ... 1")
     return to_rgb(color)

@@ -112,7 +112,7 @@ class MarginReport(Shown):
         ways = ", one recovery step allowed" * self.step + ", launch corrected" * self.feedback
         return (
             f"{len(self.margins)} margins in {self.engine}{ways}, "
-            f"{whole} of them at the limit of what is tried"
+            f"{whole} of them at the largest size tried"
         )
 
     def to_json(self) -> Plain:
