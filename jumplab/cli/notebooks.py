@@ -59,8 +59,7 @@ def check_parameters(namespace: Mapping[str, Any]) -> None:
             for name in re.findall(r"^(\w+) = ", injected, re.M):
                 if name not in known:
                     raise InputError(
-                        f"unknown notebook parameter {name!r}; this notebook has "
-                        f"{', '.join(known)}"
+                        f"unknown notebook parameter {name!r}; this notebook has {', '.join(known)}"
                     )
         for name, kind in known.items():
             check_value(name, namespace[name], kind)

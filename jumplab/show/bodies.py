@@ -44,7 +44,7 @@ from jumplab.show.style import (
 
 VIEWS = {"side": [0, 2], "front": [1, 2]}
 BELOW_M = 0.07  # of the ground: where times are written
-ABOVE_M = 0.36  # seen above the highest base: a head is 0.3 m above the shoulders
+ABOVE_M = 0.52  # seen above the highest base: raised hands are 0.45 m above the shoulders
 SHADES = {"trunk": 1.0, "limb": 0.78, "rest": 0.78, "far": 0.45}  # strengths of the colour
 BODY = "#5B6B7F"  # a robot outside of any phase
 ROLE_COLORS = {

@@ -190,7 +190,7 @@ class Record(Shown):
         landed = [name for name, run in self.runs.items() if run.landed]
         stepped = ""
         if self.value < (1 - SAME) * self.best:
-            stepped = f" (at {self.best:.3f}, reduced until the plan passes the audit; prices are for the record)"
+            stepped = f" (reduced from {self.best:.3f} until the audit passes; prices: before)"
         played = f", lands at {self.share:.0%} of it in {' and '.join(landed) or 'no engine'}"
         return (
             f"{self.plan.robot.name}: {word} at least {self.value:.3f} {self.unit} "
