@@ -80,7 +80,7 @@ def _settings(args: Namespace, **more: Any) -> Any:
 
 
 def margins(args: Namespace) -> None:
-    """How much of each disturbance a plan bears."""
+    """The largest size of each disturbance that a plan tolerates."""
     names = args.disturb or (*studies.margins.SINGLE, *studies.margins.PAIRS)
     work = studies.margins.margins
     options = given(work, args, names=names, seed=args.seed or 0, settings=_settings(args))

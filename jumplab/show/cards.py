@@ -23,7 +23,7 @@ from jumplab.show.jumps import (
     jump_strobe,
     margins,
 )
-from jumplab.show.maps import envelope_map, margin_radar
+from jumplab.show.maps import envelope_map, margin_chart
 from jumplab.show.style import (
     COLUMN_IN,
     FLIGHT,
@@ -226,7 +226,7 @@ def _scatter(report: TrialReport) -> Figure | None:
 
 
 def _of_margins(report: MarginReport) -> Card:
-    return table([margin.row() for margin in report.margins], digits=3), margin_radar(report)
+    return table([margin.row() for margin in report.margins], digits=3), margin_chart(report)
 
 
 def _of_envelope(envelope: Envelope) -> Card:
