@@ -106,6 +106,7 @@ def page(
         "fps": FPS,
         "weight": robot.total_mass * GRAVITY,
         "parts": list(map(_part, parts)),
+        "joints": list(robot.joint_names),
         "clips": [
             {"name": name, **_clip(motion, robot, scene, ways[name])}
             for name, motion in motions.items()
@@ -195,8 +196,9 @@ def _packed(values: np.ndarray) -> str:
 def _values(
     whole: Motion, motion: Motion, robot: Robot, way: Trace, forces: np.ndarray | None
 ) -> np.ndarray:
-    """What the page's table and curves show (N, 10): travel of the toes, rise of the CoM since
-    take-off [m], then the lines of the curves in ``player.js``.
+    """The values of table and curves (N, 10 + 2 joints): travel of the toes, rise of the CoM since
+    take-off [m], the lines of the curves in ``player.js``, then of each joint its angle [deg] and
+    its torque as a share of the limit.
     """
     height = way.com[:, 2]
     toes = (way.feet @ [*robot.foot.tip, 1.0])[..., 0].mean(axis=1)
@@ -205,6 +207,7 @@ def _values(
     names = robot.joint_names
     pairs = np.array([[names.index(name) for name in robot.joints[role]] for role in LEG])
     shares = np.abs(motion.tau) / [robot.actuators[name]["effort"] for name in names]
+    joints = np.stack([np.degrees(motion.q[:, 7:]), shares], axis=2).reshape(len(height), -1)
     push = np.full(len(height), np.nan) if forces is None else np.nansum(forces[..., 5], axis=1)
     return np.column_stack(
         [
@@ -214,5 +217,6 @@ def _values(
             np.degrees(motion.q[:, 7 + pairs[:, 0]]),
             shares[:, pairs].max(axis=2),
             push / (robot.total_mass * GRAVITY),
+            joints,
         ]
     )
