@@ -1,7 +1,11 @@
 """Results show themselves: one line where they are printed, a card in a notebook, columns by the names of joints."""
 
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -128,3 +132,17 @@ def test_the_users_style_wins_and_the_packages_own_stays_without_one(plan):
     assert before == 8 and label.get_fontsize() == 16 and to_rgb(fig.axes[0].get_facecolor()) == to_rgb("yellow")
     assert fig._repr_png_() != usual._repr_png_() == plan.plots.momentum()._repr_png_()
     assert plt.rcParams["font.size"] == matplotlib.rcParamsDefault["font.size"]
+
+
+def test_a_script_is_told_where_the_page_is(plan, tmp_path):
+    """Run as a file, `jl.view` prints the place of a page that is there; imported, it prints nothing."""
+    jl.save(tmp_path / "out", plan)
+    script = tmp_path / "six.py"
+    script.write_text(f"import jumplab as jl\njl.view(*jl.load({str(tmp_path / 'out')!r}))\n")
+    env = os.environ | {"JUMPLAB_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(Path(jl.__file__).parents[1])}
+    said = [
+        subprocess.run([sys.executable, *words], env=env, cwd=tmp_path, capture_output=True, text=True, check=True)
+        for words in ([script], ["-c", "import six"])
+    ]
+    place = Path(said[0].stdout.removeprefix("the jump in 3-D, for any browser: ").strip())
+    assert place.suffix == ".html" and place.stat().st_size > 1e5 and said[1].stdout == ""
