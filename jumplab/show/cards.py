@@ -67,7 +67,7 @@ def card(x: Shown) -> str | None:
     rows, figure = make(x)
     picture = ""
     if figure is not None:
-        png = base64.b64encode(figure._repr_png_()).decode()
+        png = base64.b64encode(figure.png()).decode()
         picture = f'<img src="data:image/png;base64,{png}" style="max-width: 100%">'
     title = html.escape(f"{type(x).__name__}: {x.line()}")
     return f"<div><b>{title}</b>{rows._repr_html_()}{picture}</div>"

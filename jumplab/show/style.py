@@ -7,8 +7,10 @@ closed.
 
 from __future__ import annotations
 
+import base64
+import html
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ContextDecorator, ExitStack
 from importlib import resources
 from pathlib import Path
@@ -101,18 +103,34 @@ themed = Style(whole=False)  # for pictures of results: the user's style wins
 
 
 class Picture(Figure):
-    """A figure that shows itself in a notebook, whatever backend is chosen there."""
+    """A figure that a notebook shows, whatever backend is chosen there, with its caption if it has
+    one.
+    """
 
-    _saved = b""  # its PNG, see save_figure
+    caption = ""  # and its PNG, see save_figure
+    _saved = b""
 
     def __init__(self, *args: Any, **options: Any):
         super().__init__(*args, **options)
         self.settings = _ours()  # under which it is drawn later too
 
-    def _repr_png_(self) -> bytes:
+    def png(self) -> bytes:
+        """The figure as a PNG."""
         if self._saved and not self.stale:
             return self._saved
         return _file_of(self, "png", dpi=self.get_dpi(), metadata=PNG_METADATA)
+
+    @property
+    def _repr_png_(self) -> Callable[[], bytes] | None:
+        return None if self.caption else self.png  # a notebook keeps one of both
+
+    def _repr_html_(self) -> str | None:
+        if not self.caption:
+            return None
+        words = html.escape(self.caption)
+        source = f"data:image/png;base64,{base64.b64encode(self.png()).decode()}"
+        image = f'<img src="{source}" alt="{words}" style="max-width: 100%">'
+        return f'<figure style="margin: 0">{image}<figcaption>{words}</figcaption></figure>'
 
 
 def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
@@ -254,10 +272,10 @@ def save_figure(
     """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into
     ``folder``.
 
-    The same figure gives the same bytes: the files carry neither dates nor versions of the software
-    that wrote them. It is laid out once, for the PNG; the PDF and what a notebook shows keep that
-    layout. Returns the figure. Raises :class:`InputError` if ``name`` is not a plain file name, or
-    the folder cannot be written.
+    A notebook shows the caption below the figure. The same figure gives the same bytes: the files
+    carry neither dates nor versions of the software that wrote them. It is laid out once, for the
+    PNG; the PDF and what a notebook shows keep that layout. Returns the figure. Raises
+    :class:`InputError` if ``name`` is not a plain file name, or the folder cannot be written.
     """
     if not name or Path(name).name != name or name.startswith("."):
         must = "must be a plain file name without ending, such as 'f08_joints'"
@@ -265,6 +283,7 @@ def save_figure(
     png = _file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
     fig.set_layout_engine("none")
     pdf = _file_of(fig, "pdf", metadata=PDF_METADATA)
+    fig.caption = caption.strip()
     fig._saved = png  # a notebook shows it without drawing it again ...
     fig.stale = False  # ... until it is changed
     text = caption_text(caption, task, robot).encode()
