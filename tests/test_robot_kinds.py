@@ -367,7 +367,7 @@ def test_what_is_advised_is_enough(put):
     text = text.replace('<limit lower="0.0" upper="2.3" effort="160" velocity="20"/>', "<limit/>")
     path = put(text)
     found = draft(path)
-    assert [re.search(r"tell (.*) in \[(.*)\]", x).groups() for x in found.faults] == [
+    assert [re.search(r"or give (.*) in \[(.*)\]", x).groups() for x in found.faults] == [
         ("effort, velocity", 'limits."left.knee"'),
         ("effort, velocity", 'limits."right.knee"'),
     ]

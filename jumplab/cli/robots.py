@@ -51,8 +51,8 @@ def check(args: Namespace) -> None:
     shipped = files.SHIPPED.get(urdf)
     if args.repair and (args.config is not None or shipped):
         raise InputError(
-            "--repair is for a bare URDF; a configuration has its own [source] repair, so leave "
-            "the option away"
+            "--repair is for a bare URDF; a configuration has its own [source] repair, so leave it "
+            "away"
         )
     if args.config is not None:
         try:
