@@ -5,6 +5,8 @@ them all.
 from __future__ import annotations
 
 import math
+import sys
+import tempfile
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.io import folder as folders
+from jumplab.ocp import cache
 from jumplab.ocp.nlp import patience
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
@@ -138,7 +141,7 @@ def judge(
     motion: Any, robot: Robot | str | Path = "bhr", **reading: Any
 ) -> ClipReport | list[ClipReport]:
     """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
-    fall, forces from nowhere, motors, joints, collisions.
+    fall, unphysical forces, motors, joints, collisions.
 
     Returns a report, of several clips a list. Raises :class:`InputError` for what holds no clip of
     the robot.
@@ -237,11 +240,21 @@ def load(folder: str | Path) -> Saved:
 
 @checked
 def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
-    """The jump in 3-D, plan and simulation: a notebook shows the page,
-    ``view(...).save("jump.html")`` writes it.
+    """The jump in 3-D, plan and simulation: a notebook shows the page, in a script its place is
+    printed, ``view(...).save("jump.html")`` writes it where you like.
     """
     from jumplab.show.viewer import page
     from jumplab.sim import Scene
 
     scene = Scene.of_plan(plan.summary, plan.robot)
-    return page(plan.robot, plan=plan.tape, simulation=run, task=plan.task, scene=scene)
+    made = page(plan.robot, plan=plan.tape, simulation=run, task=plan.task, scene=scene)
+    if _in_script():
+        place = cache.folder() or Path(tempfile.mkdtemp(prefix="jumplab-"))
+        print(f"the jump in 3-D, for any browser: {made.save(place / 'jump.html')}")
+    return made
+
+
+def _in_script() -> bool:
+    """Whether a file is run as a program, so that nobody sees what an expression returns."""
+    main = sys.modules.get("__main__")
+    return main.__spec__ is None and hasattr(main, "__file__") and "get_ipython" not in vars(main)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from jumplab.arguments import checked, real
-from jumplab.errors import InputError
+from jumplab.errors import InputError, Shown
 
 GRAVITY = 9.8  # [m/s^2], the paper's value; every model of the package uses it
 # [1] that every stage counts on at its nodes; between them, the audit refuses what trials may not
@@ -40,7 +40,7 @@ def _number(name: str, value: Any, low: float, high: float, unit: str) -> float:
 
 
 @dataclass(frozen=True)
-class JumpTask:
+class JumpTask(Shown):
     """Target of one jump.
 
     Attributes

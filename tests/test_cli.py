@@ -102,7 +102,7 @@ def test_refusal(capsys, here, command, sentence):
 
 def test_unknown_notebook_parameter(capsys, here):
     said = one_sentence(*run(capsys, "run", "-p", "speed=3"))
-    assert said.startswith("unknown notebook parameter 'speed'; the notebooks know ")
+    assert said.startswith("unknown notebook parameter 'speed'; the notebooks have ")
     assert names(here) == []
 
 

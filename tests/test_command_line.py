@@ -15,6 +15,7 @@ from test_cli import ROOT, one_sentence, run
 from test_store import names
 
 from jumplab import auditing
+from jumplab.cli import common
 from jumplab.cli import main as cli
 from jumplab.io import folder as store
 
@@ -69,7 +70,7 @@ IGNORED = [
      "nor --runs asks for one; leave it away"),
     ("sweep --out x --cluster tcp://a:1 --jobs 2", "--jobs is for processes of this machine, and --cluster does the "
      "work elsewhere; leave it away"),
-    ("robot check g1 --repair inertia", "--repair is for a bare URDF; a configuration says itself what is repaired, "
+    ("robot check g1 --repair inertia", "--repair is for a bare URDF; a configuration has its own [source] repair, "
      "so leave it away"),
 ]  # fmt: skip
 
@@ -113,3 +114,14 @@ def test_a_terminal_sees_what_is_going_on(planned):
                 break
     assert process.wait() == 0
     assert seen == b"" or (seen.startswith(b"\rjumplab view: ") and seen.endswith(b"\r\x1b[K"))
+
+
+def test_the_example_in_the_help_of_each_command_can_be_typed():
+    """`--help` ends with a line that the parser takes; all commands have one but those without options."""
+    parser, count = cli._parser(), 0
+    for name, options in common.OPTIONS.items():
+        if line := options.get("example"):
+            words = line.split()
+            assert parser.parse_args(words).command == words[0] and name in words[:2]
+            count += 1
+    assert count == len(cli.COMMANDS) - len(("robot", "completion")) + len(("list", "check"))

@@ -182,7 +182,7 @@ def test_footholds_are_one_unknown_in_all_phases_of_a_contact(bhr):
 # refused ------------------------------------------------------------------------------------------
 WRITE = "write L and R for flat feet, l and r for toes, left before right, or '-' for flight"
 WAIT = "a schedule begins on flat feet, at rest; there is no support to wait on"
-ALONE = "the schedule begins on one foot; where the"
+ALONE = "the schedule begins on one foot without a place for the"
 AFTER = "a foot lands only after it has left the ground"
 STEP = "the ground has one step up or down; "
 STEP += "give all places after it the same up_m, and all before it none"
@@ -235,8 +235,8 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
             lambda: schedule("LR - LR", 2, ends="touchdown"),
             "phase '3 LR': a schedule that ends with 'touchdown' has to end in flight",
         ),
-        (lambda: schedule("L LR", 1), f"phase '1 L': {ALONE} right one waits nobody says; begin with 'LR'"),
-        (lambda: schedule("R - R", 1), f"phase '1 R': {ALONE} left one waits nobody says; begin with 'LR'"),
+        (lambda: schedule("L LR", 1), f"phase '1 L': {ALONE} right one; begin with 'LR'"),
+        (lambda: schedule("R - R", 1), f"phase '1 R': {ALONE} left one; begin with 'LR'"),
         (lambda: schedule("LR lr - LR", 1), f"places: 1 given, but {CAME}; {AFTER}"),
         (lambda: schedule("LR lr LR", 2), f"places: 2 given, but feet come down 0 times (none); {AFTER}"),
         (lambda: stairs("LR - LR", 0.2, 0.3), f"places at the heights 0.2, 0.3 m: {STEP}"),

@@ -14,6 +14,7 @@ from jumplab.cli import main as command_line
 from jumplab.cli import notebooks
 from jumplab.sim import Ranges
 from jumplab.stages import joint_qp, srmp, whole_body
+from jumplab.studies.trials import OLDER
 from jumplab.task import FRICTION
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -204,3 +205,83 @@ def test_the_book_has_all_that_it_names():
 def test_the_page_of_numbers_is_that_of_the_code():
     """``python -m paper.tuning`` in the folder of the notebooks makes it."""
     assert tuning.PAGE.read_text(encoding="utf-8") == tuning.page()
+
+
+# words --------------------------------------------------------------------------------------------------------------
+# Prose is plain: subject, verb, object. What these patterns find reads like a translation, or like a riddle.
+NEVER = {
+    "a verb of saying or bearing": r"\b(?:tells?|telling|bears?|borne|speaks? (?:of|for)|whom it)\b",
+    "a word of praise or of conversation": r"\b(?:honest(?:y|ly)?|dear(?:er|est)|manieth|whom|somebody|anybody)\b",
+    "a sub-package or a margin as a room": r"\brooms?\b",
+    "a subject 'what' or 'who'": r"(?:^|(?<=[.;:!?] ))(?:What|Who|Whoever)\b[^.?!\n]*(?:[.!:;]|\n|$)",
+    "a default that is called usual but for something": r"\busual but\b",
+    "a riddle of nothing": r"\b(?:from nowhere|no room|Nothing jumps|weigh nothing|is no result)\b",
+    "a path, a door, a judge": r"\b(?:code path|opens? the door|show themselves|only judge|do two physics)\b",
+    "talk": r"\b(?:Sentences that|wrong name shows|speak alike|goes on where it|as many that)\b",
+}
+CLEAN = r"\bclean(?:ly|er|est)?\b"  # in prose: a plan passes the audit, ground is level
+
+
+def prose():
+    """(where, text) of all that users read: notebooks with their captions and messages, README, book, help."""
+    for path in NOTEBOOKS:
+        for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
+            source = "".join(cell["source"])
+            if cell["cell_type"] == "markdown":
+                yield f"{path.name}[{number}]", source
+            else:
+                texts = (text for text in texts_of(source) if " " in text)  # others are keys
+                yield from ((f"{path.name}[{number}] code", text) for text in texts)
+    yield "README.md", README
+    yield from ((f"{name}.md", page) for name, page in PAGES.items())
+    yield "options.toml", (ROOT / "jumplab" / "cli" / "options.toml").read_text(encoding="utf-8")
+    for path in MODULES:
+        yield from ((short(path), text) for text in texts_of(path.read_text(encoding="utf-8"), sentences=True))
+
+
+def texts_of(source, *, sentences=False):
+    """Texts in code, docstrings left out; ``sentences`` only those of several words."""
+    tree = ast.parse(source)
+    described = {id(node.body[0].value) for node in ast.walk(tree) if getattr(node, "body", None)
+                 and isinstance(node.body, list) and isinstance(node.body[0], ast.Expr)}  # fmt: skip
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in described:
+            if not sentences or node.value.count(" ") > 1:
+                yield node.value
+
+
+def test_prose_is_plain():
+    found = [
+        f"{where}: {kind}: ...{text[max(0, match.start() - 40) : match.end() + 20]!r}"
+        for where, text in prose()
+        for kind, pattern in NEVER.items()
+        for match in re.finditer(pattern, text, re.M)
+        if text not in OLDER  # which logs of earlier versions have
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_plans_pass_the_audit_and_are_not_called_clean():
+    """In prose; the stored studies have a column of that name."""
+    found = [f"{where}: {text[max(0, m.start() - 40) : m.end() + 20]!r}" for where, text in prose()
+             if "code" not in where and not where.endswith(".py") for m in re.finditer(CLEAN, text)]  # fmt: skip
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name[:2])
+def test_a_notebook_begins_with_its_purpose_and_says_when_its_comments_hold(path):
+    """A title, then prose of at most 120 words before the list; comments that hold for a default say so in one way."""
+    first = "".join(json.loads(path.read_text(encoding="utf-8"))["cells"][0]["source"])
+    before, _, after = first.partition("**In this notebook we**")
+    assert before.startswith("# ") and after.count("\n- ") >= 4
+    assert "default target" not in after or "The text comments on results for the default" in after
+
+
+def test_patterns_of_words_find_what_they_are_for():
+    wrong = ("What is clean is played.", "The log tells: a foot.", "here they only judge", "Who wants to know reads.",
+             "it has to know whom it speaks for", "rotors that weigh nothing", "by a second code path")  # fmt: skip
+    for text in wrong:
+        assert any(re.search(pattern, text, re.M) for pattern in NEVER.values()), text
+    right = ("What feet do is a question?", "A key `clean` is a word.", "To see what binds, read the table.")
+    for text in right:
+        assert not any(re.search(pattern, text, re.M) for pattern in NEVER.values()), text

@@ -363,6 +363,7 @@ def test_command(capsys, plan, tmp_path):
     assert (code, err) == (0, "") and said.startswith("simulation, 0.029 s, as csv: ")
     table = np.genfromtxt(plan / "simulated_joints.csv", delimiter=",", names=True)
     assert len(table) == 30 and set(table["phase_0_launch_1_flight_2_landing"]) == {2}
+    assert np.isfinite(table["left_foot_force_z_N"]).all() and 0.2 < table["com_z_m"].min() < table["base_z_m"].max()
     (plan / "simulated_joints.csv").unlink()
 
 

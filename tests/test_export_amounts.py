@@ -61,9 +61,11 @@ def test_every_number_of_the_joint_table():
     kinds = {"position_rad": motion.q[:, 7:], "velocity_rad_s": motion.v[:, 6:], "torque_N_m": motion.tau}
     head = [f"{name}_{kind}" for kind in kinds for name in WHOLE.joints]
     base = [f"base_{x}" for x in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
+    com = [f"com_{x}_m" for x in "xyz"]
+    model, data = WHOLE.robot.model, WHOLE.robot.model.createData()
     kinds["base"] = motion.q[:, :7] * np.where(np.arange(7) > 2, np.sign(motion.q[:, 6:7]), 1.0)  # w is positive
     assert lines[0].split(",") == [
-        "time_s", "phase_0_launch_1_flight_2_landing", "contact_left", "contact_right", *head, *base]  # fmt: skip
+        "time_s", "phase_0_launch_1_flight_2_landing", "contact_left", "contact_right", *head, *base, *com]  # fmt: skip
     assert len(lines) == 23  # the last whole millisecond, and the end half a one later
     for k, (line, row) in enumerate(zip(lines[1:], [*ROWS, LAST], strict=True)):
         said = line.split(",")
@@ -71,6 +73,7 @@ def test_every_number_of_the_joint_table():
         assert said[1] == {"launch": "0", "flight": "1", "landing": "2"}[motion.phase[row]]
         assert said[2:4] == ["0" if motion.phase[row] == "flight" else "1"] * 2
         rows = [x[row] if name == "base" else x[row][AT] for name, x in kinds.items()]
+        rows.append(pin.centerOfMass(model, data, motion.q[row]))
         np.testing.assert_allclose(np.array(said[4:], float), np.concatenate(rows), rtol=6e-9, atol=1e-12)
     assert max(len(x) for x in lines[1].split(",")[4:]) >= 10  # nine digits
 

@@ -16,7 +16,7 @@ PAGE = (Path(__file__).resolve().parent.parent / "notebooks" / "book" / "howto.m
 PREAMBLE, *TASKS = re.split(r"^## ", PAGE, flags=re.M)
 TASKS = {title: body for title, _, body in (task.partition("\n") for task in TASKS)}
 LINES = 10
-PLANS = ("jl.plan(", "jl.mend(")  # what takes seconds
+PLANS = ("jl.plan(", "jl.mend(", "jl.simulate(")  # what takes seconds
 
 
 def blocks(text: str, language: str) -> list[str]:
@@ -30,7 +30,7 @@ SLOW = [title for title, code in CODE.items() if code and title not in (*QUICK, 
 
 
 def test_there_are_as_many_as_the_page_says_and_each_is_short():
-    assert len(TASKS) == 13 and "Thirteen everyday tasks" in PREAMBLE and len(QUICK) >= 4
+    assert len(TASKS) == 15 and "Fifteen everyday tasks" in PREAMBLE and len(QUICK) >= 4
     for title, body in TASKS.items():
         every = blocks(body, r"(?:python|sh)")
         assert every and all(len(block.splitlines()) <= LINES for block in every), title

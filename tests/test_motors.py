@@ -297,7 +297,7 @@ def test_a_robot_in_the_air_moves_as_with_armature(bhr, engine):
 
 @pytest.mark.parametrize("engine, mode", [*zip(INSTALLED, ("position", "pd"), strict=False)])
 def test_a_jump_with_motors_lands(bhr, plan, engine, mode):
-    """And the findings know armature and friction: of a robot without, the same log has torques from nowhere."""
+    """And the findings know armature and friction: of a robot without, the same log has unphysical torques."""
     run = simulate_jump(plan.tape, plan.robot, engine=engine, mode=mode)
     assert run.landed, run.reason
     assert [f.name for f in run.checks if not f.passed] == []

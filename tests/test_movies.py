@@ -4,13 +4,16 @@ import io
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from fixtures_core import jump
 from PIL import Image
+from scipy.spatial import Delaunay
 
 import jumplab as jl
 from jumplab.errors import InputError
-from jumplab.show import movies
+from jumplab.robot.files import LEG
+from jumplab.show import movies, shapes
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +36,7 @@ def frames(data):
 
 @pytest.mark.slow
 def test_a_gif_shows_the_robot_move(plan):
-    made = jl.plots.movie(plan.robot, plan.tape)
+    made = jl.plots.movie(plan, forces=True)
     assert made.drawn_by in movies.LIBRARIES.values()
     seen = frames(made.data)
     assert seen.shape[1:] == (270, 480, 3) and made.frames == len(seen) and len(made.data) < 1.5e6
@@ -54,6 +57,37 @@ def test_an_mp4_is_one(plan, tmp_path):
 def test_refusals(plan, monkeypatch):
     with pytest.raises(InputError, match=r"^a movie must be one of gif, mp4, got 'avi'$"):
         jl.plots.movie(plan.robot, plan.tape, kind="avi")
+    with pytest.raises(InputError, match=r"^a movie of a robot needs its record, a tape or a simulation$"):
+        jl.plots.movie(plan.robot)
+    with pytest.raises(InputError, match=r"^a movie of a plan or a simulation takes no other record; leave it away$"):
+        jl.plots.movie(plan, plan.tape)
     monkeypatch.setattr(movies, "import_module", lambda name: (_ for _ in ()).throw(ImportError("none")))
     with pytest.raises(InputError, match=r"^nothing here can draw a movie: MuJoCo, EGL .* libosmesa6$"):
         jl.plots.movie(plan.robot, plan.tape)
+
+
+def test_a_camera_that_stands_still_sees_all_of_a_short_jump_and_follows_a_long_one(plan):
+    way = movies.trace(plan.robot, plan.tape.q)
+    looks, distance = movies._camera(way, 100.0)
+    assert np.ptp(looks, axis=0).max() == 0 and 2.0 < distance < 6.0
+    far = way.joints.copy()
+    far[..., 0] += np.linspace(0, 5, len(far))[:, None]
+    looks, _ = movies._camera(way._replace(joints=far), 100.0)
+    assert np.abs(looks[:, 0] - far[:, 0, 0]).max() < 0.2 and np.ptp(looks[:, 2]) == 0
+
+
+def test_limbs_of_a_drawn_body_touch_at_every_joint(plan):
+    """The parts of two links that a pitch joint joins both hold its place."""
+    robot = plan.robot
+    parts = shapes.rounded_body(robot)
+    model, data = robot.model, robot.model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+    for role in LEG[1:]:
+        for joint in map(model.getJointId, robot.joints[role]):
+            place = data.oMi[joint].translation
+            holding = {
+                part.joint
+                for part in parts
+                if part.kind != "trunk" and Delaunay(part.points).find_simplex(data.oMi[part.joint].actInv(place)) >= 0
+            }
+            assert model.parents[joint] in holding and len(holding) >= 2, model.names[joint]

@@ -12,8 +12,10 @@ from functools import partial
 from pathlib import Path
 
 import nbformat
+import numpy as np
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+from PIL import Image
 
 from jumplab.cli import notebooks
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
@@ -74,13 +76,34 @@ def test_chain_in_an_odd_place_under_this_very_python(odd_folder, monkeypatch):
     monkeypatch.chdir("/")
     report = notebooks.run_notebooks({"distance_m": 0.8, "n": 3}, notebooks=chain, progress=False)
     assert report.notebooks == ("00_first", "01_second") and report.wall_s > 0
-    assert report.out == odd_folder / "executed" and report.figures == odd_folder / "figures"
+    assert report.out == odd_folder / "executed" and report.figures == report.out / "figures"
     seen = json.loads((report.out / "seen_1.json").read_text())
     assert seen == {"distance_m": 0.8, "n": 3, "python": sys.executable, "prefix": sys.prefix}
-    assert names(report.out) == ["notebooks", "seen_0.json", "seen_1.json"]
+    assert names(report.out) == ["figures", "notebooks", "seen_0.json", "seen_1.json"]
     assert names(report.out / "notebooks") == ["00_first.ipynb", "01_second.ipynb"]
     assert names(report.figures) == ["figure_0.png", "figure_1.png"]
-    assert names(odd_folder) == ["executed", "figures", "jupyter", "notebooks"]
+    assert names(odd_folder) == ["executed", "jupyter", "notebooks"]
+
+
+def test_figures_that_look_the_same_stay(tmp_path):
+    """A picture is replaced, with its PDF and caption, where it shows; other files and damaged pictures always."""
+    work, out, figures = (tmp_path / name for name in ("work", "out", "figures"))
+    for folder in (work / "figures", work / "result", out, figures):
+        folder.mkdir(parents=True)
+    old = np.full((100, 100, 3), 255, np.uint8)
+    for name, rows in {"same": 0, "faint": 1, "other": 20}.items():
+        new = old.copy()
+        new[:rows] = 250 if name == "faint" else 0
+        Image.fromarray(old).save(figures / f"{name}.png")
+        Image.fromarray(new).save(work / "figures" / f"{name}.png")
+    for folder, text in ((figures, "old"), (work / "figures", "new")):
+        for name in ("same.txt", "faint.pdf", "other.txt", "damaged.png", "alone.txt"):
+            (folder / name).write_text(text)
+    notebooks._publish(work, out, figures)
+    texts = {name: (figures / name).read_text() for name in ("same.txt", "faint.pdf", "other.txt", "alone.txt")}
+    assert texts == {"same.txt": "old", "faint.pdf": "old", "other.txt": "new", "alone.txt": "new"}
+    assert np.asarray(Image.open(figures / "other.png"))[0].max() == 0
+    assert (figures / "damaged.png").read_text() == "new"
 
 
 @pytest.mark.parametrize(
@@ -120,7 +143,7 @@ def test_failing_notebook_stops_the_chain(tmp_path, cell, kind, sentence):
     [
         (
             {"distance": 1.0},
-            "unknown notebook parameter 'distance'; the notebooks know distance_m, figures, height_m, n, out, robot",
+            "unknown notebook parameter 'distance'; the notebooks have distance_m, figures, height_m, n, out, robot",
         ),
         ({"out": "x"}, "the parameter 'out' is set by the runner; use its own argument out"),
         ({"distance_m": "far"}, "parameter distance_m must be a number, got 'far'"),

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -146,6 +147,17 @@ def test_map_shows_what_decides():
     low, high = wilson(0, 20)
     box = friction.collections[0].get_paths()[0].vertices[:, 1]
     assert (box.min(), box.max()) == pytest.approx((low, high))
+
+
+def test_map_of_robots_that_all_land_shows_how_far_they_went():
+    """With the line of least squares: travel grows by 2 cm per ms of delay here, and not with the friction."""
+    trials = made_up(100, 0.0)
+    metrics = [SimpleNamespace(foot_distance_m=1.0 + 20.0 * t.features["delay_s"]) for t in trials]
+    trials = [replace(t, metrics=m) for t, m in zip(trials, metrics, strict=True)]
+    friction, delay = pictures.trial_map(trials).axes[:2]
+    points, line = delay.lines
+    assert len(points.get_xdata()) == 100 and np.ptp(line.get_ydata()) / np.ptp(line.get_xdata()) == pytest.approx(0.02)
+    assert delay.get_title("left") == "(b) r = 1.00" and abs(float(friction.get_title("left")[8:])) < 0.4
 
 
 def test_map_of_nothing():

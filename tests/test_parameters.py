@@ -15,7 +15,7 @@ n: int = 1  # 1 ... 9, how many"""
 @pytest.mark.parametrize(
     ("injected", "sentence"),
     [
-        ("distnace_m = 2.0", "unknown notebook parameter 'distnace_m'; this notebook knows distance_m"),
+        ("distnace_m = 2.0", "unknown notebook parameter 'distnace_m'; this notebook has distance_m"),
         ("distance_m = 'far'", "parameter distance_m must be a number, got 'far'"),
         ("distance_m = float('inf')", "parameter distance_m must be finite, got inf"),
         ("height_m = -1", "height = -1 m is outside 0.02 ... 1.5 m"),

@@ -184,7 +184,7 @@ REFUSED = [
      "robot configuration: 'source.forward' = 'ahead' must be one of +x -x +y -y +z -z"),
     (GOOD, config("x", forward="+z"), "robot configuration: forward +z and up +z must be different axes"),
     (GOOD, config("x").replace("repair = []", 'repair = ["all"]'),
-     "robot configuration: 'source.repair' knows inertia, massless, got 'all'"),
+     "robot configuration: 'source.repair' accepts inertia, massless, got 'all'"),
     (GOOD, config("x") + "[locked]\nneck = 0.1\n",
      "my.urdf: [locked] names the joint 'neck', which the URDF lacks"),
     (GOOD, config("x") + '[locked]\nleft_knee = "bent"\n',
@@ -198,7 +198,7 @@ REFUSED = [
      "my.urdf: joint 'left_knee': corner = 20 rad/s must lie between 0 and the speed limit, 20 rad/s; correct "
      "[limits.knee]"),
     (GOOD, config("x") + "[limits.knee]\neffort = -1.0\n",
-     "my.urdf: joint 'left_knee': effort = -1 N m must be positive; give the peak torque, or tell effort in "
+     "my.urdf: joint 'left_knee': effort = -1 N m must be positive; give the peak torque, or give effort in "
      "[limits.knee] of the configuration"),
     (GOOD, config("x") + "[shapes]\ntrunk_m = [[1.0, 0.0, 0.1, 0.0, 1.0]]\n",
      "robot configuration: 'shapes.trunk_m' = [[1.0, 0.0, 0.1, 0.0, 1.0]] must be a list of [rear, front, half width, "
@@ -207,7 +207,7 @@ REFUSED = [
      "robot configuration: 'shapes.thigh_thickness_m' = 0 must be positive"),
     (GOOD, config("x", toe=-0.05),
      "my.urdf: the sole [-0.1  -0.05] x [-0.05  0.05] m, -0.075 m from the ankle, must lie below it and reach to both "
-     "sides of it: the foot stands on its heel or its toes with all joints at 0, or [feet] is wrong; tell there the "
+     "sides of it: the foot stands on its heel or its toes with all joints at 0, or [feet] is wrong; give there the "
      "sole along the level axes"),
     (GOOD, config("x").replace('["left_knee", "right_knee"]', '["right_knee", "left_knee"]'),
      "my.urdf: the role joint 'right_knee' is not between 'trunk' and the foot 'left_foot'; correct [joints], [feet] "

@@ -207,7 +207,7 @@ REFUSED = [
     ("with_limits", {"joints": [("knee", 2.0)]},
      "the ranges must be a mapping from joints or roles, got [('knee', 2.0)]"),
     ("with_limits", {"joints": {"knee": {"low": 0.1}}},
-     "the range of 'knee' has lower and upper [rad], got {'low': 0.1}"),
+     "the limits of 'knee' are lower, upper [rad], effort [N m], speed [rad/s], got {'low': 0.1}"),
     ("with_limits", {"joints": {"knee": {"upper": np.inf}}}, "upper of 'knee' [rad] must be a finite number, got inf"),
     ("with_limits", {"joints": {"knee": {"lower": 3.0}}}, "joint 'left_knee' has range 3 ... 2.4 rad, effort 210 N m, "
      "speed 20 rad/s; all must be finite, positive and in order"),

@@ -84,8 +84,8 @@ def test_without_that_library(capsys, monkeypatch):
 @pytest.mark.parametrize("argv, sentence", [
     ((), "jumplab: jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible"),
     (("check", "bhr"),
-     "jumplab: 'bhr' is the default robot, described as jumplab wants it; there is nothing to check"),
-    (("check", "x.urdf", "--repair", "all"), "jumplab: --repair knows inertia, massless, got 'all'"),
+     "jumplab: 'bhr' is the default robot, described as jumplab needs it; there is nothing to check"),
+    (("check", "x.urdf", "--repair", "all"), "jumplab: --repair accepts inertia, massless, got 'all'"),
     (("check",), "jumplab: jumplab robot check: name a URDF, or a robot by --robot-description; one of the two"),
     (("check", "x.urdf", "--robot-description", "g1_description"),
      "jumplab: jumplab robot check: name a URDF, or a robot by --robot-description; one of the two"),

@@ -117,7 +117,7 @@ def test_servos_tell_no_torque_but_by_their_force_range(put):
     servo = '<position joint="left_knee" kp="100" ctrlrange="-2 2" {}/>'
     path = put(changed(MJCF, (KNEE, servo.format(""))), "a.xml")
     assert limit(path, "left_knee") is None
-    assert any("tell effort, velocity in [limits.left_knee]" in sentence for sentence in draft(path).faults)
+    assert any("give effort, velocity in [limits.left_knee]" in sentence for sentence in draft(path).faults)
     path = put(changed(MJCF, (KNEE, servo.format('forcerange="-50 80"'))), "a.xml")
     assert limit(path, "left_knee") == 50
     frames = ('<joint name="left_knee"', '<joint actuatorfrcrange="-30 40" name="left_knee"')
@@ -367,7 +367,7 @@ def test_what_is_advised_is_enough(put):
     text = text.replace('<limit lower="0.0" upper="2.3" effort="160" velocity="20"/>', "<limit/>")
     path = put(text)
     found = draft(path)
-    assert [re.search(r"tell (.*) in \[(.*)\]", x).groups() for x in found.faults] == [
+    assert [re.search(r"or give (.*) in \[(.*)\]", x).groups() for x in found.faults] == [
         ("effort, velocity", 'limits."left.knee"'),
         ("effort, velocity", 'limits."right.knee"'),
     ]

@@ -211,7 +211,7 @@ def test_a_robot_of_mujoco_is_the_same_robot():
     roles = find_roles(found)
     assert {k: roles.joints[k] for k in LEGS} == LEGS
     assert draft(path).faults[0] == (
-        "mini.xml: joint 'left_hip_pitch': MJCF has no speed limits; tell velocity in [limits.left_hip_pitch] of the "
+        "mini.xml: joint 'left_hip_pitch': MJCF has no speed limits; give velocity in [limits.left_hip_pitch] of the "
         "configuration"
     )
 

@@ -16,6 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from fixtures_core import jump
+from IPython.core.formatters import DisplayFormatter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.text import Text
@@ -194,6 +195,18 @@ def test_saving_writes_three_files_without_dates(tmp_path, bhr):
         assert not DATES.search(data)
     pixels = plt.imread(folder / "x.png").shape[1::-1]
     assert pixels == pytest.approx(style.DPI * fig.get_size_inches(), abs=1)
+
+
+def test_a_notebook_shows_the_caption_below_a_saved_figure(tmp_path):
+    """And as the alternative text, escaped; by IPython's own formatter, with the picture once."""
+    fig = plotting.new_figure()
+    before = DisplayFormatter().format(fig)[0]
+    plotting.save_figure(fig, "x", tmp_path, 'Torque < limit, "dashed".')
+    after = DisplayFormatter().format(fig)[0]
+    words = "Torque &lt; limit, &quot;dashed&quot;."
+    assert "image/png" in before and "text/html" not in before and "image/png" not in after
+    assert f'alt="{words}"' in after["text/html"] and f"<figcaption>{words}</figcaption>" in after["text/html"]
+    assert fig.png() == (tmp_path / "x.png").read_bytes()
 
 
 @pytest.mark.parametrize("name", ["jump_strobe", "reach_envelope"])

@@ -142,7 +142,7 @@ def test_forces_stand_on_the_soles_and_carry_the_jump(page, simulation, bhr):
 
 def test_figures_and_curves_are_those_of_the_simulation(page, simulation, bhr):
     clip, row = facts_of(page)["clips"][0], 30
-    distance, rise, height, *_ = values = packed(clip, "values", 10).T
+    distance, rise, height, *_ = values = packed(clip, "values", 10 + 2 * len(bhr.joint_names)).T
     at = [int(np.argmin(np.abs(simulation.t - k / 50))) for k in range(clip["frames"])]
     assert height == pytest.approx(simulation.com[at, 2], abs=1e-5)
     assert rise.max() == pytest.approx(simulation.metrics.com_rise_m, abs=1e-3)
@@ -153,6 +153,11 @@ def test_figures_and_curves_are_those_of_the_simulation(page, simulation, bhr):
         both = [abs(simulation.torque[n][at[row]]) / bhr.actuators[n]["effort"] for n in bhr.joints[role]]
         assert values[6 + k, row] == pytest.approx(max(both), abs=1e-5)
     assert values[9, -1] == pytest.approx(1.0, abs=0.02)  # it stands
+    for k, name in enumerate(bhr.joint_names):
+        assert facts_of(page)["joints"][k] == name
+        assert values[10 + 2 * k] == pytest.approx(np.degrees(simulation.angle[name][at]), abs=1e-3)
+        share = abs(simulation.torque[name][at[row]]) / bhr.actuators[name]["effort"]
+        assert values[11 + 2 * k, row] == pytest.approx(share, abs=1e-5)
 
 
 def test_rounded_body_stands_on_the_soles_between_the_joints(bhr):

@@ -12,6 +12,7 @@ from fixtures_core import jump
 from test_show_page import CHROMIUM, FLAGS, STAGE, browser, count, published
 
 import jumplab as jl
+from jumplab.io.motion import Motion
 from jumplab.show import viewer as viewer
 from jumplab.show.viewer import FPS
 from jumplab.sim import simulate_jump
@@ -214,3 +215,76 @@ def test_meshes_of_a_published_robot(tab, tmp_path):
     tab.goto(f"{file.as_uri()}#t=1.1")
     assert "published meshes" in tab.locator("#note").inner_text()
     assert count(picture(tab), "flight") > 3000 and tab.trouble == []
+
+
+def test_keys_and_buttons_step_by_a_frame(tab, url):
+    tab.goto(f"{url}#t=0.5")
+    for press, seconds in (
+        (lambda: tab.keyboard.press("ArrowRight"), 0.52),
+        (lambda: tab.locator("#on").click(), 0.54),
+        (lambda: tab.locator("#back").click(), 0.52),
+        (lambda: tab.keyboard.press("ArrowLeft"), 0.5),
+        (lambda: tab.keyboard.press("Home"), 0.0),
+    ):
+        press()
+        assert clock(tab) == seconds
+    tab.keyboard.press("End")
+    assert clock(tab) == pytest.approx(float(tab.locator("#time").get_attribute("max")), abs=0.01) and tab.trouble == []
+
+
+def test_curves_of_one_joint_a_legend_and_names_above_the_robots(tab, url, simulation):
+    tab.goto(f"{url}#t=1.0&show=both")
+    titles = tab.locator("#curves h2")
+    assert "hip" in titles.nth(1).inner_text() and titles.count() == 4
+    tab.locator("#joint").select_option(label="right shoulder pitch")
+    shown = titles.nth(1).inner_text()
+    row = int(np.argmin(np.abs(simulation.t - 1.0)))
+    angle = round(float(np.degrees(simulation.angle["right_shoulder_pitch"][row])))
+    assert titles.count() == 4 and shown == f"right shoulder pitch angle [°] {angle}".replace("-", "\u2212")
+    legend = tab.locator("#legend").inner_text()
+    assert all(word in legend for word in ("launch", "flight", "landing", "force of the ground", "the plan beside"))
+    names = tab.locator("#labels span").filter(has_text="simulation")
+    assert not names.is_visible()
+    tab.locator("#offset").evaluate("(e) => { e.value = 0.6; e.dispatchEvent(new Event('input')); }")
+    tab.wait_for_function("[...document.querySelectorAll('#labels span')].every((e) => e.style.display === '')")
+    assert names.is_visible()
+    tab.locator("#show").select_option("plan")
+    gone = "[...document.querySelectorAll('#labels span')].every((e) => e.textContent !== 'plan' || e.style.display)"
+    tab.wait_for_function(gone)
+    assert tab.trouble == []
+
+
+def test_it_starts_at_its_first_frame_when_it_is_seen(tab, url, tmp_path):
+    """Far below in another page it waits; scrolled to, it plays from 0."""
+    far = tmp_path / "far.html"
+    far.write_text(f'<div style="height: 5000px"></div><iframe src="{url}" width="800" height="600"></iframe>')
+    tab.goto(far.as_uri())
+    (frame,) = tab.main_frame.child_frames
+    frame.wait_for_selector("#clock")
+    tab.wait_for_timeout(1500)
+    assert frame.evaluate("[playing, now]") == [False, 0]
+    tab.evaluate("scrollTo(0, 1e6)")
+    frame.wait_for_function("playing")
+    first = frame.evaluate("now")
+    assert first < 0.6, "the first frames are skipped"
+    frame.wait_for_function(f"now > {first}")
+
+
+def test_the_trail_of_a_chain_leads_to_its_last_landing(tab, tmp_path):
+    """Two jumps in one record, the second as the first one but 1 m on: beads lie under both flights."""
+    p = jump(1.0, 0.5)
+    tape = p.tape
+    t, q, phase = (getattr(tape, name) for name in ("t", "q", "phase"))
+    later = q.copy()
+    later[:, 0] += 1.0
+    stand = np.array(["landing"] * 2)
+    motion = Motion(
+        np.concatenate([t, [t[-1] + 0.1, t[-1] + 0.2], t + t[-1] + 0.3, [2 * t[-1] + 0.4, 2 * t[-1] + 0.6]]),
+        np.concatenate([q, later[:1], later[:1], later, later[-1:], later[-1:]]),
+        *(np.zeros((2 * len(t) + 4, n)) for n in (p.robot.model.nv, p.robot.model.nv - 6)),
+        np.concatenate([phase, stand, phase, stand]), "simulation",
+    )  # fmt: skip
+    tab.goto(viewer.page(p.robot, simulation=motion).save(tmp_path / "chain.html").as_uri() + "#t=0")
+    spheres = "clips[0].group.children.filter((x) => x.geometry && x.geometry.type === 'SphereGeometry')"
+    beads = tab.evaluate(f"{spheres}.map((x) => x.position.x)")
+    assert min(beads) < 0.2 and max(beads) > 1.8

@@ -150,7 +150,7 @@ def test_camera_sees_the_robot_where_the_log_says(result, bhr):
         places = np.column_stack([x.ravel() + q[0], z.ravel()])
         inside = [Path(outline).contains_points(places) for _, outline in outlines.outlines(q)]
         balls = [p for name, p in outlines.joints(q).items() if "pitch" in name or "knee" in name]
-        inside += [np.hypot(*(places - ball).T) < render.JOINT_RADIUS_M for ball in balls]
+        inside += [np.hypot(*(places - ball).T) < 0.03 for ball in balls]
         wanted = np.any(inside, axis=0).reshape(seen.shape)
         assert wanted.sum() > 1000
         assert not (seen & ~binary_dilation(wanted, square, iterations=4)).any()

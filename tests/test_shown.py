@@ -1,15 +1,23 @@
 """Results show themselves: one line where they are printed, a card in a notebook, columns by the names of joints."""
 
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
+import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from fixtures_core import jump
+from matplotlib.colors import to_rgb
 
 import jumplab as jl
 from jumplab.errors import InputError
+from jumplab.show import jumps
 from jumplab.sim import SimulationResult
 
 
@@ -84,7 +92,7 @@ def test_columns_have_names(plan):
 
 def test_logs_without_a_robot_say_how_to_get_one(plan):
     logs = SimulationResult(**dict.fromkeys([f for f in SimulationResult.__dataclass_fields__ if f != "robot"]))
-    with pytest.raises(InputError, match=r"^these logs do not know their robot; read them with jl\.load$"):
+    with pytest.raises(InputError, match=r"^the robot of these logs is unknown; read them with jl\.load$"):
         _ = logs.torque
 
 
@@ -92,7 +100,7 @@ def test_a_frame_needs_pandas(plan):
     try:
         import pandas  # noqa: F401
     except ImportError:
-        with pytest.raises(InputError, match=r"^a frame needs pandas: pip install pandas$"):
+        with pytest.raises(InputError, match=r"^a frame needs pandas: pip install 'jumplab\[pandas\]'$"):
             plan.to_frame()
     else:
         frame = plan.to_frame()
@@ -102,3 +110,61 @@ def test_a_frame_needs_pandas(plan):
 def test_pictures_by_name(plan):
     for draw in (plan.plots.strobe, plan.plots.joints, plan.plots.torques, plan.plots.momentum):
         assert draw().axes
+
+
+def test_tasks_statistics_terms_and_planners_have_cards_too(plan):
+    for x, word in (
+        (plan.task, "CoM rise 0.50 m"),
+        (plan.statistics, "iterations"),
+        (plan.terms(), "more rows</summary>"),
+        (jl.Planner(plan.robot), "none yet"),
+    ):
+        page = x._repr_html_()
+        assert word in page and "<table>" in page, type(x)
+    assert "bhr, built: nothing yet" in repr(jl.Planner(plan.robot)) and isinstance(plan.statistics, tuple)
+
+
+def test_active_limits_are_those_that_the_plan_uses_up(plan):
+    """A bar stands where a joint is as near to a stop, or gives as much of its torque, as planners may use."""
+    fig = plan.plots.active()
+    (ax,) = fig.axes
+    names = [label.get_text() for label in ax.get_yticklabels()]
+    bars = {name: [] for name in names}
+    for bar in ax.collections:
+        for path in bar.get_paths():
+            x, y = path.vertices[:, 0], path.vertices[:, 1]
+            bars[names[round(y.mean() - 1e-9)]].append((x.min(), x.max()))
+    share = jumps.Limits().torque_share
+    most = share * plan.robot.limits.range(plan.tape.v[:, 6:])[1]
+    k = list(plan.tape.joint_names).index("left_ankle_pitch")
+    used = plan.tape.tau[:, k] >= jumps.FULL * most[:, k]
+    spans = bars.get("ankle pitch, torque", [])
+    shown = np.any([(plan.t >= a) & (plan.t <= b) for a, b in spans], axis=0) if spans else np.zeros(len(plan.t), bool)
+    assert names and all(spans for spans in bars.values()) and not (used & ~shown).any()
+    least = jumps.active(plan, replace(jumps.Limits(), torque_share=5.0, range_margin_rad=-0.2))
+    assert not any("torque" in x.get_text() or "stop" in x.get_text() for x in least.axes[0].get_yticklabels())
+
+
+def test_the_users_style_wins_and_the_packages_own_stays_without_one(plan):
+    usual = plan.plots.momentum()
+    before = usual.axes[0].yaxis.label.get_fontsize()
+    with plt.style.context({"font.size": 16, "axes.grid": False, "axes.facecolor": "yellow"}):
+        fig = plan.plots.momentum()
+    label = fig.axes[0].yaxis.label
+    assert before == 8 and label.get_fontsize() == 16 and to_rgb(fig.axes[0].get_facecolor()) == to_rgb("yellow")
+    assert fig._repr_png_() != usual._repr_png_() == plan.plots.momentum()._repr_png_()
+    assert plt.rcParams["font.size"] == matplotlib.rcParamsDefault["font.size"]
+
+
+def test_a_script_is_told_where_the_page_is(plan, tmp_path):
+    """Run as a file, `jl.view` prints the place of a page that is there; imported, it prints nothing."""
+    jl.save(tmp_path / "out", plan)
+    script = tmp_path / "six.py"
+    script.write_text(f"import jumplab as jl\njl.view(*jl.load({str(tmp_path / 'out')!r}))\n")
+    env = os.environ | {"JUMPLAB_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(Path(jl.__file__).parents[1])}
+    said = [
+        subprocess.run([sys.executable, *words], env=env, cwd=tmp_path, capture_output=True, text=True, check=True)
+        for words in ([script], ["-c", "import six"])
+    ]
+    place = Path(said[0].stdout.removeprefix("the jump in 3-D, for any browser: ").strip())
+    assert place.suffix == ".html" and place.stat().st_size > 1e5 and said[1].stdout == ""

@@ -108,7 +108,7 @@ def test_killed_for_good(tmp_path):
     assert 1 <= before.count(b"\n") and not (out / sweep.TABLE).exists()
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "3 cases, 3 planned, 3 of them clean in the audit; table in " in done.stdout
+    assert "3 cases, 3 planned, 3 passed the audit; table in " in done.stdout
     assert log.read_bytes().startswith(before[: before.rindex(b"\n") + 1])
     assert len((out / sweep.TABLE).read_text().splitlines()) == 4
 

@@ -19,7 +19,7 @@ from test_store import make_tape, names
 
 from jumplab.errors import InputError, SolverError
 from jumplab.io import folder as store
-from jumplab.show import margin_radar
+from jumplab.show import margin_chart
 from jumplab.sim import Finding, Perturbation, Ranges, Scene, SensorNoise, Sign, SimulationResult, signs
 from jumplab.studies import margins
 from jumplab.studies import study as studies
@@ -365,14 +365,14 @@ def test_margins_of_other_ways_and_their_picture(folder, monkeypatch):
     monkeypatch.setattr(monte_carlo, "run_trial", trial)
     with_step, usual = found(("payload_kg", "mass"), step=True), found(("payload_kg",))
     found(("mass",), mode="whole-body", feedback=True)
-    figure = margin_radar({"usual": usual, "one step": with_step})
+    figure = margin_chart({"usual": usual, "one step": with_step})
     assert [ax.get_title("left") for ax in figure.axes] == ["plain", "re-aimed"]
     for ax in figure.axes:
         assert [line.get_label() for line in ax.lines] == ["usual", "one step"]
-        assert [text.get_text() for text in ax.get_xticklabels()] == ["payload_kg"]  # what both tell
-    assert not margin_radar(usual).legends and len(figure.legends) == 1
-    with pytest.raises(InputError, match="up to 4 reports and what two of them tell, got 5 reports with 1 dist"):
-        margin_radar({str(k): usual for k in range(5)})
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["payload_kg"]  # which both have
+    assert not margin_chart(usual).legends and len(figure.legends) == 1
+    with pytest.raises(InputError, match="up to 4 reports with disturbances in two of them, got 5 reports with 1 dist"):
+        margin_chart({str(k): usual for k in range(5)})
 
 
 def test_margins_of_what_is_not_there(folder):

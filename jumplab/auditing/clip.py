@@ -83,7 +83,7 @@ def phases_of(ground: np.ndarray, fps: float) -> list[tuple[str, float, float]]:
 def judge(
     motion: Any, robot: Robot | str = "bhr", *, fps: float | None = None, order: str = "depth-first"
 ) -> ClipReport | list[ClipReport]:
-    """Judge a motion: float, penetration, slip, flights against free fall, forces from nowhere,
+    """Judge a motion: float, penetration, slip, flights against free fall, unphysical forces,
     motors, joints, collisions.
 
     Returns a report, of a folder and of a file with several clips a list of them. Raises
@@ -261,9 +261,9 @@ def _measures(r: Replay, ground: np.ndarray, falls: list[Fall]) -> Iterator[Meas
     off = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
     yield "flights fall freely", off, [times[0] for times, _, _ in falls]
     missing = norm(r.base_residual[:, :3]) / r.weight
-    yield "force from nowhere", *_most(missing, t, METHOD.force_percent)
+    yield "unphysical force", *_most(missing, t, METHOD.force_percent)
     moment = norm(r.base_residual[:, 3:]) / r.weight
-    yield "moment from nowhere", *_most(moment, t, METHOD.force_percent)
+    yield "unphysical moment", *_most(moment, t, METHOD.force_percent)
 
 
 def _inner(ground: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -278,7 +278,7 @@ def _series(r: Replay) -> dict[str, np.ndarray]:
     torque = np.abs(r.tape.tau) / r.model.upperEffortLimit[6:]
     return {
         "lowest point of each sole [m]": r.sole_points[..., 2].min(axis=2),
-        "force from nowhere [m g]": norm(r.base_residual[:, :3]) / r.weight,
+        "unphysical force [m g]": norm(r.base_residual[:, :3]) / r.weight,
         "largest torque [of the limit]": torque.max(axis=1),
     }
 

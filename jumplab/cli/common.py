@@ -122,9 +122,11 @@ def declare(
     for work in commands:
         text = work.__doc__ or ""
         name = work.__name__.rstrip("_")
-        one = below.add_parser(name, help=text[:1].lower() + text[1:].rstrip("."))
-        one.set_defaults(work=work)
         options = dict(OPTIONS[name])
+        example = options.pop("example", None)
+        help_ = text[:1].lower() + text[1:].rstrip(".")
+        one = below.add_parser(name, help=help_, epilog=example and f"example: jumplab {example}")
+        one.set_defaults(work=work)
         shared = {usage: OPTIONS["shared"][usage] for usage in options.pop("shared", ())}
         for usage, how in (shared | options).items():
             add_option(one, usage, **how)

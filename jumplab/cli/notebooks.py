@@ -32,6 +32,9 @@ from jumplab.cli.common import robots, store
 from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
 from jumplab.task import JumpTask
 
+# two figures look different where a colour differs by more, in more than this share of the pixels
+SEEN_DIFFERENCE = 32.0
+SEEN_SHARE = 1e-3
 STANDARD = ("distance_m", "height_m", "robot", "out", "figures")  # parameters of every notebook
 TYPES = {kind.__name__: kind for kind in (int, bool, float, str)}
 PATTERN = "[0-9][0-9]_*.ipynb"
@@ -59,8 +62,7 @@ def check_parameters(namespace: Mapping[str, Any]) -> None:
             for name in re.findall(r"^(\w+) = ", injected, re.M):
                 if name not in known:
                     raise InputError(
-                        f"unknown notebook parameter {name!r}; this notebook knows "
-                        f"{', '.join(known)}"
+                        f"unknown notebook parameter {name!r}; this notebook has {', '.join(known)}"
                     )
         for name, kind in known.items():
             check_value(name, namespace[name], kind)
@@ -172,8 +174,8 @@ def run_notebooks(
     parameters : name -> value, for instance ``{"distance_m": 0.8}``.
     out : result folder; if None, ``executed`` in the checkout, or where one is if there is no
         checkout.
-    figures : their folder; if None, ``figures`` in ``out`` if that is given or there is no
-        checkout, else in the checkout (or in its result folder where the checkout is read-only).
+    figures : their folder, ``figures`` in ``out`` if None. One that is there stays if the new one
+        looks the same.
     progress : show a bar per notebook on stderr.
     jobs : notebooks side by side; one per core if None.
     """
@@ -185,16 +187,10 @@ def run_notebooks(
     values = _checked(dict(parameters or {}), declared.values())
     root = notebooks[0].parent.parent
     installed = notebooks[0].is_relative_to(_PACKAGE)
-    own_place = out is not None or installed
     if out is None:
         out = (Path.cwd() if installed else root) / "executed"
     out = store.ensure_writable(out).resolve()
-    if figures is None:
-        figures = out / "figures"
-        if not own_place:
-            with suppress(InputError):
-                figures = store.ensure_writable(root / "figures")
-    figures = store.ensure_writable(figures).resolve()
+    figures = store.ensure_writable(out / "figures" if figures is None else figures).resolve()
     executed = reading.below(out, "notebooks")
     reading.below(out, "failed")
     if executed.is_dir():
@@ -232,7 +228,7 @@ def _checked(values: dict[str, Any], declared: Iterable[Kinds]) -> dict[str, Any
             )
         if name not in known:
             raise InputError(
-                f"unknown notebook parameter {name!r}; the notebooks know {', '.join(known)}"
+                f"unknown notebook parameter {name!r}; the notebooks have {', '.join(known)}"
             )
         for kinds in declared:
             check_value(name, value, kinds.get(name))
@@ -351,6 +347,25 @@ def _publish(work: Path, out: Path, figures: Path) -> None:
         for p in (work / "result").iterdir():
             if p.is_file():
                 os.replace(p, staging / p.name)
-    for p in (work / "figures").rglob("*"):
-        if p.is_file():
-            store.write_file(figures / p.relative_to(work / "figures"), p.read_bytes())
+    made = work / "figures"
+    files = [p.relative_to(made) for p in made.rglob("*") if p.is_file()]
+    same = {
+        p.with_suffix("") for p in files if p.suffix == ".png" and _alike(made / p, figures / p)
+    }
+    for p in files:
+        if p.with_suffix("") not in same:
+            store.write_file(figures / p, (made / p).read_bytes())
+
+
+def _alike(new: Path, old: Path) -> bool:
+    """Whether two pictures look the same; the ``old`` one may be missing, or no picture."""
+    import numpy as np  # both not before something is published
+    from PIL import Image
+
+    try:
+        one, other = (np.asarray(Image.open(path).convert("RGB"), float) for path in (new, old))
+    except (OSError, ValueError):
+        return False
+    if one.shape != other.shape:
+        return False
+    return float((np.abs(one - other).max(axis=2) > SEEN_DIFFERENCE).mean()) < SEEN_SHARE

@@ -47,12 +47,12 @@ def check(args: Namespace) -> None:
         print(f"robot description: {urdf}")
     for word in args.repair:
         if word not in jumper.REPAIRS:
-            raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")
+            raise InputError(f"--repair accepts {', '.join(jumper.REPAIRS)}, got {word!r}")
     shipped = files.SHIPPED.get(urdf)
     if args.repair and (args.config is not None or shipped):
         raise InputError(
-            "--repair is for a bare URDF; a configuration says itself what is repaired, so leave "
-            "it away"
+            "--repair is for a bare URDF; a configuration has its own [source] repair, so leave it "
+            "away"
         )
     if args.config is not None:
         try:
@@ -70,7 +70,7 @@ def check(args: Namespace) -> None:
         result = checkup.examine(urdf)
     else:
         raise InputError(
-            f"{urdf!r} is the default robot, described as jumplab wants it; there is nothing to "
+            f"{urdf!r} is the default robot, described as jumplab needs it; there is nothing to "
             f"check"
         )
     robot = result.robot
@@ -112,7 +112,7 @@ def _draft(urdf: str, text: str, repair: tuple[str, ...], out: str | None, force
         first, *others = faults
         print("".join(f"{sentence}\n" for sentence in others), end="")
         if path:
-            print(f"what is needed stands in comments in {path}; with --config {path} check again")
+            print(f"comments in {path} list the missing data; check again with --config {path}")
         above = f" ({len(others)} further faults are printed above)" if others else ""
         raise RobotError(first + above)
     return draft.text

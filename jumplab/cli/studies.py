@@ -80,7 +80,7 @@ def _settings(args: Namespace, **more: Any) -> Any:
 
 
 def margins(args: Namespace) -> None:
-    """How much of each disturbance a plan bears."""
+    """The largest size of each disturbance that a plan tolerates."""
     names = args.disturb or (*studies.margins.SINGLE, *studies.margins.PAIRS)
     work = studies.margins.margins
     options = given(work, args, names=names, seed=args.seed or 0, settings=_settings(args))
@@ -334,7 +334,7 @@ def sweep(args: Namespace) -> None:
     table = Path(args.out, studies.sweep.TABLE)
     args.found |= {"table": table, "rows": rows}
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
-    outcome = f"{planned} planned, {clean} of them clean in the audit"
+    outcome = f"{planned} planned, {clean} passed the audit"
     print(f"{len(rows)} cases, {outcome}; table in {table}")
 
 

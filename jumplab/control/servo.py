@@ -174,7 +174,7 @@ class WholeBodyServo:
     step in ``substeps`` semi-implicit ones: joints whose rates are right run ahead by half of one.
     """
 
-    told = "angles, rates and accelerations; it measures base and joints, and knows how feet stand"
+    told = "angles, rates, accelerations and contacts; it measures base and joints"
 
     def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
         self._step_s = STEP_S + late_s

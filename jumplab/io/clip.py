@@ -75,7 +75,7 @@ class Clip(Shown):
         """That of a plan, a tape or a simulation; ``robot`` if it does not carry its own."""
         robot = getattr(record, "robot", None) or robot
         if robot is None:
-            raise InputError("the motion does not know its robot; pass it as robot=")
+            raise InputError("the robot of this motion is unknown; pass it as robot=")
         motion = Motion.of(getattr(record, "tape", record)).every(fps or RECORD_FPS)
         return cls(motion.source, robot, motion.q, fps or RECORD_FPS, "a motion of this package")
 
@@ -298,7 +298,7 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
     notes = []
     rate = raw.fps or fps or raw.usual_fps
     if raw.fps is None:
-        notes.append(f"{rate:g} frames per second {'as told' if fps else 'taken for granted'}")
+        notes.append(f"{rate:g} frames per second {'as given' if fps else 'assumed'}")
     elif fps is not None and abs(fps - raw.fps) > 0.01 * raw.fps:
         raise InputError(
             f"{where}: has {raw.fps:g} frames per second by itself, and fps = {fps:g} is given; "

@@ -22,15 +22,36 @@ BASE = tuple(f"base_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", 
 OF_JOINTS = {"position_rad": ("q", 7), "velocity_rad_s": ("v", 6), "torque_N_m": ("tau", 0)}
 
 
-def table_of(record: Record, joints: Sequence[str]) -> dict[str, np.ndarray]:
+COM = ("com_x_m", "com_y_m", "com_z_m")
+FORCES = tuple(f"{foot}_foot_force_{x}_N" for foot in ("left", "right") for x in "xyz")
+
+
+class Rows(Shown, tuple):
+    """Rows of a table, mappings or dataclasses, which a notebook shows as one."""
+
+    __slots__ = ()
+
+    def line(self) -> str:
+        """How many there are."""
+        return f"{len(self)} rows"
+
+    __repr__ = tuple.__repr__
+
+
+def table_of(record: Record, joints: Sequence[str], com: np.ndarray) -> dict[str, np.ndarray]:
     """Columns (N,) of a record by name: position, velocity and torque of every joint, in the
-    record's order of ``joints``, then the base's place and quaternion.
+    record's order of ``joints``, then the base's place and quaternion, the ``com`` (N, 3) [m], and,
+    where they are known, the forces on the feet [N].
     """
     table = {}
     for kind, (name, first) in OF_JOINTS.items():
         columns = getattr(record, name)[:, first:].T
         table |= {f"{joint}_{kind}": x for joint, x in zip(joints, columns, strict=True)}
-    return table | dict(zip(BASE, record.q[:, :7].T, strict=True))
+    table |= dict(zip((*BASE, *COM), (*record.q[:, :7].T, *com.T), strict=True))
+    wrench = getattr(record, "wrench", getattr(record, "foot_wrench", getattr(record, "f", None)))
+    if wrench is not None:
+        table |= dict(zip(FORCES, wrench[..., :3].reshape(-1, 6).T, strict=True))
+    return table
 
 
 class Columns(Mapping[str, np.ndarray]):
@@ -78,7 +99,7 @@ class Named:
 
     def _columns(self, values: np.ndarray, unit: str) -> Columns:
         if self.robot is None:
-            raise InputError("these logs do not know their robot; read them with jl.load")
+            raise InputError("the robot of these logs is unknown; read them with jl.load")
         return Columns(values, self.robot, unit)
 
     @property
@@ -109,7 +130,7 @@ class Named:
         try:
             import pandas
         except ImportError:
-            raise InputError("a frame needs pandas: pip install pandas") from None
+            raise InputError("a frame needs pandas: pip install 'jumplab[pandas]'") from None
         x = self._record
-        table = {"phase": x.phase} | table_of(x, list(self.angle))
+        table = {"phase": x.phase} | table_of(x, list(self.angle), self.com)
         return pandas.DataFrame(table, index=pandas.Index(x.t, name="time_s"))

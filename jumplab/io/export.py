@@ -93,8 +93,8 @@ def _encoded(ending: str, content: Any) -> bytes:
 # and their rate [1/s].
 # -----------------------------------------------------------------------------------
 def joint_table(whole: Whole, x: Motion, fps: float) -> str:
-    """Time, phase, contacts, position, velocity and torque of every joint (F), then the base's
-    place and quaternion, with commas between.
+    """Time, phase, contacts, position, velocity and torque of every joint (F), the base's place and
+    quaternion, the CoM, and the forces on the feet where they are known, with commas between.
 
     One header line with units, one line per frame; take-off, which a tape holds twice, stands once.
     """
@@ -105,7 +105,7 @@ def joint_table(whole: Whole, x: Motion, fps: float) -> str:
         "contact_left": left,
         "contact_right": right,
     }
-    rest = table_of(x, whole.joints)
+    rest = table_of(x, whole.joints, whole.com(x.q))
     digits = ["%.6f", *["%d"] * 3, *["%.9g"] * len(rest)]
     return _rows(np.column_stack([*head.values(), *rest.values()]), ",".join(head | rest), digits)
 

@@ -68,6 +68,12 @@ class Whole:
         """Configurations (F, nq) and velocities (F, nv) of :meth:`frames` in Pinocchio's order."""
         return self._in_order(x.q, 7), self._in_order(x.v, 6)
 
+    def com(self, q: np.ndarray) -> np.ndarray:
+        """CoM (F, 3) [m] at configurations (F, nq) of :meth:`frames`."""
+        data = self.model.createData()
+        rows = self._in_order(q, 7)
+        return np.array([pin.centerOfMass(self.model, data, row).copy() for row in rows])
+
     def _in_order(self, values: np.ndarray, base: int) -> np.ndarray:
         """Rows (F, ``base`` + J) in Pinocchio's order, of such with joints depth-first."""
         out = values.copy()
@@ -109,7 +115,7 @@ class Whole:
         q = np.hstack([q[:, :7], q[:, 7 + order]])
         v = np.hstack([v[:, :6], v[:, 6 + order]])
         t = x.t - x.t[0]
-        return Motion(t, q, v, tau[:, order], x.phase, x.source, contact=x.contact)
+        return Motion(t, q, v, tau[:, order], x.phase, x.source, x.wrench, x.contact)
 
     def own(self, q: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
         """The inverse of :meth:`frames`: configurations (F, nq) of the robot that jumps, from those

@@ -1,4 +1,4 @@
-"""Why there is no plan: terms that are no number, or terms that leave each other no room."""
+"""Why there is no plan: terms that are no number, or terms that conflict."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def reasons(
             (),
         )
     named = "; ".join(worst)
-    return f": the best compromise still violates {named}; they leave each other no room", worst
+    return f": the best compromise still violates {named}; these constraints conflict", worst
 
 
 def check_start(a: Assembled, posed: Posed) -> None:

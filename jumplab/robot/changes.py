@@ -35,7 +35,7 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
     Parameters
     ----------
     factors : "effort", "speed" -> factor, or joint or role -> factor.  ranges : joint or role ->
-        lower, upper [rad].
+        lower, upper [rad], effort [N m], speed [rad/s].
 
     Raises :class:`RobotError` as :meth:`.Robot.with_limits` says.
     """
@@ -53,14 +53,19 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
         if not (
             isinstance(ranges[key], Mapping)
             and 0 < len(ranges[key])
-            and set(ranges[key]) <= set(ENDS)
+            and set(ranges[key]) <= set(UNITS)
         ):
             raise robot.error(
-                f"the range of {key!r} has lower and upper [rad], got {quoted(ranges[key])}"
+                f"the limits of {key!r} are lower, upper [rad], effort [N m], speed [rad/s], got "
+                f"{quoted(ranges[key])}"
             )
         for end, angle in ranges[key].items():
-            angle = _number(robot, f"{end} of {key!r} [rad]", angle)
+            motor = end not in ENDS
+            angle = _number(robot, f"{end} of {key!r} [{UNITS[end]}]", angle, positive=motor)
             for name in names:
+                if motor:
+                    new[name][end] = angle
+                    continue
                 # it turns against its role
                 other = key not in robot.joint_names and signs[name] < 0
                 new[name][ENDS[end] if other else end] = -angle if other else angle

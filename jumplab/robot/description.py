@@ -287,8 +287,13 @@ class Robot(Shown):
         ----------
         effort, speed : factors [1] on the limits as they are: one for all joints, or a mapping from
             joints or roles.
-        joints : joint or role -> ``lower``, ``upper`` [rad], one or both; a role's in the signs of
-            :attr:`sagittal`.
+        joints : joint or role -> new values of ``lower``, ``upper`` [rad], ``effort`` [N m] or
+            ``speed`` [rad/s], some or all; the range of a role in the signs of :attr:`sagittal`.
+
+        Roles are those of :attr:`joints`, or hip, knee, ankle, shoulder; where a joint and its role
+        are both named, the joint's own counts. The URDF gets the new numbers, the TOML a remark on
+        each, so the :attr:`hash` is new. Raises :class:`RobotError` for names that the robot lacks,
+        for numbers that are no limits, and if the robot cannot stand within them.
         """
         factors = {"effort": effort, "speed": speed}
         return self._changed(*changes.limits(self, factors, joints))

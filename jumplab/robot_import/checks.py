@@ -376,7 +376,7 @@ def limit_faults(
     if wrong := wrong_limits(tree, joint, given):
         keys = ", ".join(keys_of(wrong))
         link = ";" if tree.format == "MJCF" else ", or"
-        advice = f"{link} tell {keys} in [{table}] of the configuration" if table else ""
+        advice = f"{link} give {keys} in [{table}] of the configuration" if table else ""
         yield f"{tree.where}: joint {joint!r}: {'; '.join(wrong.values())}{advice}"
 
 

@@ -115,7 +115,7 @@ def _source(config: dict) -> dict:
     for word in out["repair"]:
         if word not in REPAIRS:
             raise RobotError(
-                f"robot configuration: 'source.repair' knows {', '.join(REPAIRS)}, got {word!r}"
+                f"robot configuration: 'source.repair' accepts {', '.join(REPAIRS)}, got {word!r}"
             )
     return out
 
@@ -161,7 +161,7 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
         raise RobotError(
             f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
             f"must lie below it and reach to both sides of it: the foot stands on its heel or its "
-            f"toes with all joints at 0, or [feet] is wrong; tell there the sole along the level "
+            f"toes with all joints at 0, or [feet] is wrong; give there the sole along the level "
             f"axes"
         )
     return {"heel": float(x[0]), "toe": float(x[1]), "half": float(half), "z": float(z)}

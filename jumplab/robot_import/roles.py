@@ -259,7 +259,7 @@ class _Finder:
             even = "the feet reach as far ahead as behind"
             notes.append(
                 f"where it faces is a guess, by {by or 'nothing'}: the knees bend both ways, and "
-                f"{', '.join(against) + ' speak against it' if against else even}; if it faces the "
+                f"{', '.join(against) + ' disagree' if against else even}; if it faces the "
                 f"other way, give [source] facing"
             )
         return left if total > 0 else -left

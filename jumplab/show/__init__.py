@@ -8,11 +8,12 @@ and grey.
 >>> fig = jl.plots.joint_trajectories(plan.tape, robot)
 >>> jl.plots.save_figure(fig, "joints", "figures", "Joints.", task=plan.task, robot=robot)
 
-A new figure is a function under :func:`styled` that begins with :func:`new_figure` (``COLUMN_IN``
-or ``PAGE_IN`` wide) and returns it. :func:`by_phase` draws curves, :func:`compare` curves over what
-was asked for; :class:`Silhouette` with :func:`draw_robot`, :func:`strobe` or :func:`film_strip`
-draws bodies; :func:`legend_above` takes :func:`phase_handles`. The 3-D page is :func:`page`; tables
-are :func:`table`.
+These figures keep settings of Matplotlib that you changed, as by ``plt.style.use("ggplot")``. A new
+figure is a function under :func:`themed` (or :func:`styled`, which keeps none) that begins with
+:func:`new_figure` (``COLUMN_IN`` or ``PAGE_IN`` wide) and returns it. :func:`by_phase` draws
+curves, :func:`compare` curves over what was asked for; :class:`Silhouette` with :func:`draw_robot`,
+:func:`strobe` or :func:`film_strip` draws bodies; :func:`legend_above` takes :func:`phase_handles`.
+The 3-D page is :func:`page`; tables are :func:`table`.
 """
 
 import inspect
@@ -22,8 +23,9 @@ import lazy_loader as lazy
 
 _NAMES = {  # module: its public names, loaded when they are first used
     # for plans, for simulations, and the map of what a robot can do
-    "jumps": "joint_trajectories inertia_and_momentum margins ground_reaction jump_strobe momentum",
-    "maps": "envelope_map margin_radar",
+    "jumps": """joint_trajectories inertia_and_momentum margins active ground_reaction jump_strobe
+        momentum""",
+    "maps": "envelope_map margin_chart",
     # the jump in 3-D, the page of a certificate, tables
     "viewer": "Page page",
     "movies": "Movie movie",
@@ -33,7 +35,7 @@ _NAMES = {  # module: its public names, loaded when they are first used
     # helpers: bodies, with the sheet of a robot; curves, colours and saving
     "bodies": """robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points
         draw_ground draw_path draw_com equal_scales""",
-    "style": """use_style styled new_figure save_figure by_phase compare mark_time limits
+    "style": """use_style styled themed new_figure save_figure by_phase compare mark_time limits
         phase_handles legend_above panel_letters bare tint shade describe_task COLUMN_IN PAGE_IN
         PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY VERMILION INK LIMIT_STYLE REFERENCE_STYLE
         MIN_FONT_PT""",

@@ -23,7 +23,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.sagittal import rotated
 from jumplab.robot.stance import stance_angles, stance_configuration
-from jumplab.show.shapes import rounded_boxes
+from jumplab.show.shapes import rounded_body
 from jumplab.show.style import (
     FLIGHT,
     GROUND,
@@ -38,13 +38,13 @@ from jumplab.show.style import (
     bare,
     new_figure,
     shade,
-    styled,
+    themed,
     tint,
 )
 
 VIEWS = {"side": [0, 2], "front": [1, 2]}
 BELOW_M = 0.07  # of the ground: where times are written
-ABOVE_M = 0.36  # seen above the highest base: a head is 0.3 m above the shoulders
+ABOVE_M = 0.52  # seen above the highest base: raised hands are 0.45 m above the shoulders
 SHADES = {"trunk": 1.0, "limb": 0.78, "rest": 0.78, "far": 0.45}  # strengths of the colour
 BODY = "#5B6B7F"  # a robot outside of any phase
 ROLE_COLORS = {
@@ -71,7 +71,7 @@ class Silhouette:
         self._axes = VIEWS[view]
         self._data = robot.model.createData()
         pin.forwardKinematics(self._model, self._data, pin.neutral(self._model))
-        parts = rounded_boxes(robot)
+        parts = rounded_body(robot)
         left = [self._data.oMi[p.joint].act(p.points.mean(axis=0))[1] for p in parts]
         if view == "side":  # far ones first
             parts = [parts[k] for k in np.argsort(left, kind="stable")]
@@ -246,7 +246,7 @@ def equal_scales(ax: Axes) -> None:
 # the sheet of a robot
 # ----------------------------------------------------------------------------------------------
 @checked
-@styled
+@themed
 def robot_sheet(robot: Robot) -> Figure:
     """A robot standing, its moving joints with their roles from the front, and its five links."""
     fig = new_figure(PAGE_IN, 3.0)

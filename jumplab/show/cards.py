@@ -1,4 +1,4 @@
-"""What a notebook shows of a result alone in a cell: a line, a small table, a picture."""
+"""Cards: a line, a small table and a picture of a result that stands alone in a notebook's cell."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import html
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +15,14 @@ from matplotlib.figure import Figure
 from jumplab.arguments import checked
 from jumplab.errors import InputError, Shown
 from jumplab.show.bodies import robot_sheet
-from jumplab.show.jumps import inertia_and_momentum, joint_trajectories, jump_strobe, margins
-from jumplab.show.maps import margin_radar
+from jumplab.show.jumps import (
+    active,
+    inertia_and_momentum,
+    joint_trajectories,
+    jump_strobe,
+    margins,
+)
+from jumplab.show.maps import envelope_map, margin_chart
 from jumplab.show.style import (
     COLUMN_IN,
     FLIGHT,
@@ -25,22 +32,27 @@ from jumplab.show.style import (
     PAGE_IN,
     VERMILION,
     Picture,
+    describe_task,
     new_figure,
-    styled,
+    themed,
 )
 from jumplab.show.tables import Table, table
 from jumplab.stages.plan import JumpPlan
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.auditing import AuditReport, ClipReport
+    from jumplab.io.columns import Rows
     from jumplab.robot import Robot
-    from jumplab.sim import SimulationResult
+    from jumplab.sim import Metrics, SimulationResult
+    from jumplab.stages import Planner
+    from jumplab.studies.envelope import Envelope
     from jumplab.studies.improve import Improved
     from jumplab.studies.margins import MarginReport
     from jumplab.studies.mend import Mended
     from jumplab.studies.prices import Prices
     from jumplab.studies.record import Record
     from jumplab.studies.trials import TrialReport
+    from jumplab.task import JumpTask
 
 MOST_BINDING = 12  # limits of a record that are shown, the dearest
 MOST_PRICES = 14  # and prices
@@ -56,7 +68,7 @@ def card(x: Shown) -> str | None:
     rows, figure = make(x)
     picture = ""
     if figure is not None:
-        png = base64.b64encode(figure._repr_png_()).decode()
+        png = base64.b64encode(figure.png()).decode()
         picture = f'<img src="data:image/png;base64,{png}" style="max-width: 100%">'
     title = html.escape(f"{type(x).__name__}: {x.line()}")
     return f"<div><b>{title}</b>{rows._repr_html_()}{picture}</div>"
@@ -112,7 +124,7 @@ def _of_audit(report: AuditReport) -> Card:
     return table(rows), _shares(report)
 
 
-@styled
+@themed
 def _shares(report: AuditReport) -> Figure | None:
     """How much of its limit each check uses, the fullest above."""
     used = sorted(
@@ -138,7 +150,7 @@ def _of_clip(report: ClipReport) -> Card:
 
 
 @checked
-@styled
+@themed
 def clip_sheet(report: ClipReport) -> Figure:
     """What a judged clip does over time; shaded where no foot carries."""
     fig = new_figure(PAGE_IN, 4.2)
@@ -180,7 +192,7 @@ def _of_prices(prices: Prices) -> Card:
     return table(rows, columns, digits=3), price_bars(prices)
 
 
-@styled
+@themed
 def price_bars(prices: Prices) -> Figure:
     """What one per cent more of each limit (a degree, 0.01 of friction) buys, with the records that
     check it; hollow where other limits take over.
@@ -207,7 +219,7 @@ def _of_trials(report: TrialReport) -> Card:
     return table(report.rows()), _scatter(report)
 
 
-@styled
+@themed
 def _scatter(report: TrialReport) -> Figure | None:
     """Travel and rise of the robots that landed."""
     values = [report.values(name) for name in ("foot_distance_m", "com_rise_m")]
@@ -221,10 +233,56 @@ def _scatter(report: TrialReport) -> Figure | None:
 
 
 def _of_margins(report: MarginReport) -> Card:
-    return table([margin.row() for margin in report.margins], digits=3), margin_radar(report)
+    return table([margin.row() for margin in report.margins], digits=3), margin_chart(report)
+
+
+def _of_envelope(envelope: Envelope) -> Card:
+    rows = []
+    for word in ("highest", "farthest"):
+        cell = getattr(envelope, word)
+        row = {name: getattr(cell, name) for name in envelope.axes} if cell else {}
+        rows.append({"": word, **row, "uses most": cell.limiting if cell else "no jump"})
+    return table(rows), envelope_map(envelope)
+
+
+def _of_metrics(m: Metrics) -> Card:
+    rows = [
+        {"": f.name, "value": getattr(m, f.name)}
+        for f in fields(m)
+        if not isinstance(getattr(m, f.name), Mapping)
+    ]
+    return table([row for row in rows if row["value"] not in (None, ())]), None
+
+
+def _of_task(task: JumpTask) -> Card:
+    rows = [
+        {"": "target", "value": describe_task(task)},
+        {"": "speed at take-off [m/s], upwards", "value": task.takeoff_speed},
+        {"": "time in the air [s], at equal heights", "value": task.flight_time()},
+        {"": "gravity [m/s^2]", "value": task.gravity},
+    ]
+    return table(rows), None
+
+
+def _of_planner(planner: Planner) -> Card:
+    rows = [
+        {"": "robot", "value": planner.robot.line()},
+        {"": "stages built", "value": ", ".join(planner.built) or "none yet"},
+        {"": "limits", "value": str(planner.limits)},
+    ]
+    return table(rows), None
+
+
+def _of_rows(rows: Rows) -> Card:
+    return table([x if isinstance(x, Mapping) else vars(x) for x in rows]), None
 
 
 CARDS: Mapping[str, Callable[[Any], Card]] = {
+    "Envelope": _of_envelope,
+    "Metrics": _of_metrics,
+    "JumpTask": _of_task,
+    "Planner": _of_planner,
+    "Rows": _of_rows,
     "JumpPlan": _of_plan,
     "SimulationResult": _of_run,
     "Robot": _of_robot,
@@ -249,15 +307,19 @@ class Plots:
         self._of = of
 
     def __repr__(self) -> str:
-        return "<Plots: strobe(), joints(), torques(), momentum()>"
+        return "<Plots: strobe(), joints(), torques(), active(), momentum()>"
 
     def strobe(self) -> Figure:
         """The jump in one picture."""
         return jump_strobe(getattr(self._of, "tape", self._of), self._of.robot)
 
     def joints(self) -> Figure:
-        """Angles and velocities of the joints, within their limits."""
-        return joint_trajectories(self._planned().tape, self._of.robot)
+        """Angles, velocities and torques of the joints over time, within their limits."""
+        return joint_trajectories(self._planned().tape, self._of.robot, torques=True)
+
+    def active(self) -> Figure:
+        """Which limit binds when."""
+        return active(self._planned())
 
     def torques(self) -> Figure:
         """Torque against speed of each joint; CoP and friction."""

@@ -35,11 +35,12 @@ from jumplab.show.style import (
     panel_letters,
     phase_handles,
     shade,
-    styled,
+    themed,
 )
 from jumplab.show.style import (
     limits as draw_limits,
 )
+from jumplab.stages.plan import JumpPlan
 from jumplab.stages.whole_body import Limits
 
 if TYPE_CHECKING:  # pictures need no simulator
@@ -50,6 +51,10 @@ COLUMNS = 3  # of the panels of limits
 AFTER_TOUCHDOWN_S = 0.25  # how much of the landing is shown
 FLIGHT_SHARES = (0.25, 0.5, 0.75)  # when frames of the flight are shown
 STRIP_M = 0.72  # from frame to frame, just more than a robot with its arms stretched out
+# a limit is used up from this share on, this near to a stop or to the end of a sole
+FULL = 0.985
+NEAR_STOP_RAD = 0.01
+NEAR_EDGE_M = 0.004
 LEAST_SHARE = 0.02  # of the weight on a foot: below, CoP and friction are 0/0 and not drawn
 MOMENTUM, INERTIA = "$L$ [kg m$^2$/s]", "$\\rho$ [kg m$^2$]"
 # name on the tape and component of each curve in the plane, and out of it: of the plan alone ...
@@ -115,29 +120,36 @@ def _panels(curves: dict[str, tuple], handles: list, height: float) -> tuple[Fig
 
 
 @checked
-@styled
+@themed
 def joint_trajectories(
-    tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    tape: Tape,
+    robot: Robot,
+    *,
+    guess: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    torques: bool = False,
 ) -> Figure:
     """F-8: one column per pair of joints, angle above and velocity below, limits thin.
 
     Parameters
     ----------
+    torques : a third row, of torques and of the most that each motor gives at its speed then.
     guess : time (n,) [s], joint angles (n, 4) [rad] and rates (n, 4) [rad/s] in sagittal signs to
         draw dashed, such as stage 2's; of a jump in the plane alone.
     """
     joints = _joints(tape, robot)
     motors = robot.limits
     signs = {name: (row, sign) for name, row, sign in robot.role_signs()}
-    fig = new_figure(PAGE_IN, 3.1)
-    axes = fig.subplots(2, len(joints), sharex=True)
+    fig = new_figure(PAGE_IN, 4.5 if torques else 3.1)
+    axes = fig.subplots(3 if torques else 2, len(joints), sharex=True)
     for column, (title, sides) in zip(axes.T, joints.items(), strict=True):
         motor = motors[sides[0]]
         panels = (
             (tape.q[:, 7:], motor.lower, motor.upper),
             (tape.v[:, 6:], -motor.speed, motor.speed),
         )
-        for k, (ax, (values, low, high)) in enumerate(zip(column, panels, strict=True)):
+        if torques:
+            _draw_torques(column[2], tape, motor, sides)
+        for k, (ax, (values, low, high)) in enumerate(zip(column[:2], panels, strict=True)):
             for i, opacity in zip(sides, OPACITIES, strict=False):
                 by_phase(ax, tape.t, values[:, i], tape.phase, alpha=opacity)
             if guess is not None:
@@ -148,17 +160,27 @@ def joint_trajectories(
             room = 0.06 * (high - low)
             ax.set_ylim(low - room, high + room)
         column[0].set_title(title.removesuffix(" pitch"), fontsize=8 if len(joints) < 5 else 7)
-        column[1].set_xlabel("time [s]")
-    axes[0, 0].set_ylabel("angle [rad]")
-    axes[1, 0].set_ylabel("velocity [rad/s]")
+        column[-1].set_xlabel("time [s]")
+    labels = ("angle [rad]", "velocity [rad/s]", "torque [N m]")
+    for ax, label in zip(axes[:, 0], labels, strict=False):
+        ax.set_ylabel(label)
     fig.align_ylabels(axes[:, 0])
     dashed = None if guess is None else "stage 2, the guess"
     legend_above(fig, phase_handles("launch", "flight", limit="limit", reference=dashed))
     return fig
 
 
+def _draw_torques(ax: Axes, tape: Tape, motor: MotorLimits, sides: list[int]) -> None:
+    """Torques of a pair of joints over time, within what their motors give at their speeds."""
+    for i, opacity in zip(sides, OPACITIES, strict=False):
+        by_phase(ax, tape.t, tape.tau[:, i], tape.phase, alpha=opacity)
+    for edge in motor.range(tape.v[:, 6 + sides[0]]):
+        ax.plot(tape.t, edge, **LIMIT_STYLE)
+    mark_time(ax, [_heel_up_time(tape)])
+
+
 @checked
-@styled
+@themed
 def inertia_and_momentum(tape: Tape) -> Figure:
     """F-9: inertia, CoM velocity and angular momentum of the plan; dashed what stage 1 asked for.
 
@@ -182,7 +204,7 @@ def inertia_and_momentum(tape: Tape) -> Figure:
 # limits
 # ----------------------------------------------------------------------------------------------
 @checked
-@styled
+@themed
 def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
     """Torque against speed of each joint in its envelope; CoP in the sole and friction used through
     the launch.
@@ -205,13 +227,13 @@ def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
             by_phase(ax, tape.v[:, 6 + i], tape.tau[:, i], tape.phase, linewidth=1.1, alpha=opacity)
         ax.set(title=title, ylabel="torque [N m]")
     _draw_contact(axes["cop"], axes["friction"], tape, robot, limits)
-    reference = "what the planner may use"
+    reference = "limit of the planner"
     legend_above(fig, phase_handles("launch", "flight", limit="limit", reference=reference))
     return fig
 
 
 def _draw_motor(ax: Axes, motor: MotorLimits, limits: Limits) -> None:
-    """What a motor can do, torque against speed; dashed what the planner may use."""
+    """A motor's torque against speed, as far as it goes; dashed as far as the planner goes."""
     corner, free = motor.corner_speed, motor.no_load_speed
     x = np.array([-free, -corner, 0.0, corner, free])
     edges = motor.range(x)
@@ -219,11 +241,11 @@ def _draw_motor(ax: Axes, motor: MotorLimits, limits: Limits) -> None:
     for edge in edges:
         ax.plot(x, edge, **LIMIT_STYLE)
     cut = limits.speed_share * motor.speed
-    top = limits.torque_share * motor.effort
-    left = min(1.0, (free - cut) / (free - corner))
-    allowed = np.array([[-cut, min(corner, cut), cut, cut], [top, top, top * left, -top]])
+    rates = np.array([-cut, min(corner, cut), cut, cut])
+    most = limits.torque_share * motor.range(rates)[1]
+    most[-1] = -limits.torque_share * motor.effort
     for sign in (1, -1):
-        ax.plot(*(sign * allowed), **REFERENCE_STYLE)
+        ax.plot(sign * rates, sign * most, **REFERENCE_STYLE)
     ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * free, 1.08 * free))
     ax.set_ylim(-1.12 * motor.effort, 1.12 * motor.effort)
 
@@ -245,6 +267,64 @@ def _draw_contact(cop: Axes, friction: Axes, tape: Tape, robot: Robot, limits: L
     for ax, label in ((cop, "CoP from the toe [cm]"), (friction, "friction used")):
         mark_time(ax, [_heel_up_time(tape)])
         ax.set(xlabel="time [s]", ylabel=label)
+
+
+@checked
+@themed
+def active(plan: JumpPlan, limits: Limits | None = None) -> Figure:
+    """Which limit of a plan binds when: a bar while a joint, a foot or the friction uses all that
+    the planner may use, in the colour of the phase.
+
+    ``limits`` are the planner's, its defaults if None. Bars of left and right are one.
+    """
+    tape = plan.tape
+    rows = _used_up(tape, plan.robot, limits or Limits())
+    rows = {name: used for name, used in rows.items() if used.any()}
+    names = sorted(rows, key=lambda name: -int(np.argmax(rows[name])))
+    fig = new_figure(PAGE_IN, 0.9 + 0.2 * len(names))
+    ax = fig.subplots()
+    for k, name in enumerate(names):
+        for phase, color in PHASE_COLORS.items():
+            used = rows[name] & (tape.phase == phase)
+            edges = np.flatnonzero(np.diff(np.r_[False, used, False].astype(int)))
+            last = len(tape.t) - 1
+            bars = [(tape.t[a], tape.t[min(b, last)] - tape.t[a]) for a, b in edges.reshape(-1, 2)]
+            ax.broken_barh(bars, (k - 0.35, 0.7), facecolor=color, edgecolor=color, linewidth=0.8)
+    mark_time(ax, (_heel_up_time(tape), tape.takeoff_time))
+    ax.set_yticks(range(len(names)), names)
+    ax.set(xlabel="time [s]", xlim=(tape.t[0], tape.t[-1]), ylim=(-0.6, len(names) - 0.4))
+    ax.grid(False, axis="y")
+    legend_above(fig, phase_handles(*dict.fromkeys(map(str, tape.phase))))
+    return fig
+
+
+def _used_up(tape: Tape, robot: Robot, limits: Limits) -> dict[str, np.ndarray]:
+    """Limit in words -> whether it is used up (N,), of the joints, the soles and the friction."""
+    motors = robot.limits
+    speeds, torques = tape.v[:, 6:], tape.tau
+    least, most = (limits.torque_share * edge for edge in motors.range(speeds))
+    room = limits.range_margin_rad + NEAR_STOP_RAD
+    found = {
+        "torque": (torques >= FULL * most) | (torques <= FULL * least),
+        "speed": np.abs(speeds) >= FULL * limits.speed_share * motors.speed,
+        "lower stop": tape.q[:, 7:] <= motors.lower + room,
+        "upper stop": tape.q[:, 7:] >= motors.upper - room,
+    }
+    rows = {}
+    for title, sides in _joints(tape, robot).items():
+        rows |= {f"{title}, {what}": used[:, sides].any(axis=1) for what, used in found.items()}
+    ground = ground_reaction(tape, robot)
+    launch = tape.phase == "launch"
+    length = robot.foot.toe - robot.foot.heel
+    back = ground["cop_x"] + length - limits.cop_margin_m
+    for what, used in {
+        "CoP at the heel": back <= NEAR_EDGE_M,
+        "CoP at the toe": ground["cop_x"] >= -NEAR_EDGE_M,
+        "friction": ground["friction"] >= FULL * limits.friction,
+    }.items():
+        rows[what] = np.zeros(len(tape.t), bool)
+        rows[what][launch] = used.any(axis=1)
+    return rows
 
 
 @checked
@@ -274,7 +354,7 @@ def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
 # simulations
 # ----------------------------------------------------------------------------------------------
 @checked
-@styled
+@themed
 def jump_strobe(record: SimulationResult | Tape, robot: Robot) -> Figure:
     """F-1: a simulated or planned jump in one picture, each phase in its colour, with the CoM's
     path.
@@ -325,7 +405,7 @@ def _strip_rows(record: SimulationResult | Tape, height: np.ndarray) -> np.ndarr
 
 
 @checked
-@styled
+@themed
 def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     """F-12: CoM position [m] and velocity [m/s], inertia, and L during the launch; dashed the plan,
     coloured the simulation.

@@ -1,4 +1,4 @@
-"""Pictures of many jumps: the map of those that a robot can do, and how much a plan bears."""
+"""Pictures of many jumps: the map of those that a robot can do, the disturbances it tolerates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jumplab.show.style import (
     LAUNCH,
     PAGE_IN,
     new_figure,
-    styled,
+    themed,
     tint,
 )
 from jumplab.studies.envelope import BEYOND, OPEN, Envelope
@@ -42,12 +42,11 @@ AXIS_WORDS = {
     "side_m": "to the left [m]",
     "yaw_rad": "turn [rad]",
 }
-RADAR_COLORS = LAUNCH, FLIGHT, INK, LANDING
-RADAR_WIDTHS = 4.0, 2.6, 0.8, 1.6  # equal lines show below each other
+MARKS = (LAUNCH, "o"), (FLIGHT, "s"), (INK, "^"), (LANDING, "D")  # of several reports
 
 
 @checked
-@styled
+@themed
 def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
     """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much
     of it.
@@ -108,43 +107,42 @@ def _draw_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: s
 
 
 @checked
-@styled
-def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
-    """How much of each disturbance plans bear, as a share of the largest that is tried: plain, and
-    re-aimed.
+@themed
+def margin_chart(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
+    """The largest size of each disturbance that plans tolerate, as a share of the largest tried:
+    plain, and with re-aim; one mark per report.
 
     Of several reports, by the names that the legend shall have, only the disturbances that two or
-    more of them have. Raises :class:`InputError` for more reports than colours, or if nothing is
-    left to show.
+    more of them have. Raises :class:`InputError` for more reports than marks, or if nothing is left
+    to show.
     """
     several = dict(reports) if isinstance(reports, Mapping) else {"": reports}
     for report in several.values():
         if not hasattr(report, "margins"):
-            raise InputError(f"the radar shows reports of margins, got {quoted(report)}")
+            raise InputError(f"the chart shows reports of margins, got {quoted(report)}")
     counts = Counter(m.names for report in several.values() for m in report.margins if m.reaim)
     names = [name for name, count in counts.items() if count > 1 or len(several) == 1]
-    if not names or len(several) > len(RADAR_COLORS):
-        given = f"{len(several)} reports with {len(names)} disturbances that two of them tell"
-        most = f"up to {len(RADAR_COLORS)} reports and what two of them tell"
-        raise InputError(f"the radar shows {most}, got {given}")
-    fig = new_figure(PAGE_IN, 3.8)
-    angles = np.linspace(0, 2 * np.pi, len(names) + 1)  # the first again, so that lines close
-    words = [name.replace("+", " +\n").replace("shove_", "shove_\n") for name in names]
-    panels = fig.subplots(1, 2, subplot_kw={"projection": "polar"})
+    if not names or len(several) > len(MARKS):
+        given = f"{len(several)} reports with {len(names)} disturbances in two of them"
+        most = f"up to {len(MARKS)} reports with disturbances in two of them"
+        raise InputError(f"the chart shows {most}, got {given}")
+    fig = new_figure(PAGE_IN, 0.9 + 0.3 * len(names))
+    panels = fig.subplots(1, 2, sharey=True)
+    rows = np.arange(len(names))[::-1]
+    apart = 0.7 * (np.arange(len(several)) / max(len(several), 2) - 0.5)
     for ax, reaim in zip(panels, (False, True), strict=True):
-        lines = zip(several.items(), RADAR_COLORS, RADAR_WIDTHS, strict=False)
-        for (title, report), color, width in lines:
+        for k, (title, report) in enumerate(several.items()):
             shares = {m.names: 100 * m.share for m in report.margins if m.reaim == reaim}
-            values = [shares.get(name, np.nan) for name in (*names, names[0])]
-            look = dict(color=color, linewidth=width, marker="o", markersize=2 + width)
-            ax.plot(angles, values, label=title, **look)
-        ax.set(ylim=(0, 105), theta_offset=np.pi / 2, theta_direction=-1)
-        ax.set_title("re-aimed" if reaim else "plain", fontsize=8, pad=14)
-        ax.set_xticks(angles[:-1], words, fontsize=6)
-        ax.set_yticks([25, 50, 75, 100], ["25 %", "50 %", "75 %", "100 %"], fontsize=6, zorder=5)
-        ax.set_rlabel_position(-180 / len(names))  # between the last and the first
-        ax.tick_params(axis="x", pad=11)  # clear of the circle
+            values = np.array([shares.get(name, np.nan) for name in names])
+            color, marker = MARKS[k]
+            ax.hlines(rows - apart[k], 0, values, color=tint(color, 0.5), linewidth=1.0)
+            look = dict(color=color, marker=marker, linestyle="none", markersize=4, label=title)
+            ax.plot(values, rows - apart[k], clip_on=False, zorder=3, **look)
+        ax.set_title("re-aimed" if reaim else "plain")
+        ax.set(xlim=(0, 100), xlabel="share of the largest size tried [%]")
+        ax.set_yticks(rows, names)
+        ax.grid(False, axis="y")
     if "" not in several:
-        handles = ax.get_legend_handles_labels()
-        fig.legend(*handles, loc="outside lower center", ncols=len(several))
+        handles, labels = ax.get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=len(several))
     return fig

@@ -1,7 +1,7 @@
-"""A jump as a moving picture, MP4 or GIF: the bodies of the 3-D page, drawn by MuJoCo without a
+"""A jump as an animation, MP4 or GIF: the bodies of the 3-D page, drawn by MuJoCo without a
 display.
 
->>> jl.plots.movie(robot, run, scene).save("jump.gif")
+>>> jl.plots.movie(run).save("jump.gif")
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module, resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import imageio.v3 as images
 import numpy as np
@@ -20,17 +20,20 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter1d
 
 from jumplab.arguments import checked
-from jumplab.errors import InputError, require_type
+from jumplab.errors import InputError
 from jumplab.io.files import settle, write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.io.progress import tell
 from jumplab.robot import Robot
-from jumplab.show.shapes import PAINTS, parts_of, trace
+from jumplab.show.shapes import PAINTS, Trace, ground_forces, parts_of, trace
 from jumplab.show.style import INK
 from jumplab.sim.scene import Scene
+from jumplab.stages.plan import JumpPlan
 
 if TYPE_CHECKING:
     import mujoco
+
+    from jumplab.sim import SimulationResult
 
 KINDS = {"gif": ("image/gif", (480, 270)), "mp4": ("video/mp4", (848, 480))}  # type, size [pixels]
 RATES = {"gif": 20.0, "mp4": 30.0}  # frames a second
@@ -38,13 +41,28 @@ LIBRARIES = {"egl": "MuJoCo, EGL", "osmesa": "MuJoCo, OSMesa"}  # of OpenGL with
 # how fast it is shown, and how much of the standing
 SPEED = 0.5
 AFTER_TOUCHDOWN_S = 0.8
-# the camera: distance, direction
-VIEW_M = 3.5
-AZIMUTH_DEG = 115.0
+# the camera: direction, opening (also in world.xml), and how much is seen around the jump
+AZIMUTH_DEG = 110.0
 TILT_DEG = -9.0
-GLIDE_S = 0.25  # the camera follows the trunk, smoothed over this time
+OPENING_DEG = 36.0
+# in heights of the highest joint of the robot that stands
+HEAD = 0.44  # above the highest joint
+LOW = 0.24  # below the lowest
+AROUND = 1.1  # before and behind the jump, together
+FIXED_M = 2.0  # jumps up to this length are seen by a camera that stands still
+GLIDE_S = 0.25  # of longer ones it follows the trunk, smoothed over this time
 SHOWN_M = -6.0, 8.0  # of the ground
-COLORS = 64  # of a GIF: more is larger, and looks the same
+FINER = 2  # frames are drawn larger by this, and averaged
+COLORS = 200  # of a GIF: more is larger, and looks the same
+# lines across the ground, where the toes start and land, and every so often
+MARK_RGBA = (0.835, 0.369, 0.0, 1.0)
+LINE_RGBA = (0.62, 0.66, 0.72, 1.0)
+LINE_M = 0.5
+LINE_HALF_M = np.array([0.008, 0.6, 0.0015])
+# arrows of the ground's force: length for the robot's weight, radius
+ARROW_M = 0.6
+ARROW_RADIUS_M = 0.018
+ARROW_RGBA = np.array([0.70, 0.07, 0.37, 0.9], np.float32)
 
 
 @checked
@@ -72,38 +90,103 @@ class Movie:
 
 @checked
 def movie(
-    robot: Robot, record: Record | Motion, scene: Scene | None = None, kind: str = "gif"
+    of: Robot | JumpPlan | SimulationResult,
+    record: Record | Motion | None = None,
+    scene: Scene | None = None,
+    kind: str = "gif",
+    *,
+    forces: bool = False,
 ) -> Movie:
     """A planned or simulated jump at half its speed, until it stands; launch, flight and landing in
-    their colours.
+    their colours, lines across the ground every 0.5 m and where the toes start and land.
 
-    ``kind`` is "gif" or "mp4" (20 or 30 frames a second). Raises :class:`InputError` for another
-    one, or where nothing can draw.
+    Parameters
+    ----------
+    of : a plan or a simulation, shown on its own ground; or a robot, whose ``record`` (a tape or a
+        simulation) follows.
+    scene : another ground; flat if a robot is given and this is None.
+    kind : "gif" or "mp4" (20 or 30 frames a second).
+    forces : draw the forces of the ground, an arrow for each foot; 0.6 m are the robot's weight.
+
+    Raises :class:`InputError` for another kind, a robot without a record, or where nothing can
+    draw.
     """
-    require_type(robot, Robot, "the robot of a movie")
     if kind not in KINDS:
         raise InputError(f"a movie must be one of {', '.join(KINDS)}, got {kind!r}")
-    motion = Motion.of(record)
-    motion = motion.every(RATES[kind] / SPEED)
+    robot, record, scene = _subject(of, record, scene)
+    rate = RATES[kind] / SPEED
+    whole = Motion.of(record)
+    motion = whole.every(rate)
     landing = motion.t[motion.phase == "landing"]
     shown = motion.t <= (landing[0] + AFTER_TOUCHDOWN_S if len(landing) else np.inf)
-    q = motion.q[shown]
-    # where the camera looks [m]
-    width = max(1, round(GLIDE_S * RATES[kind] / SPEED)) | 1
-    ahead = uniform_filter1d(motion.q[:, 0], width, mode="nearest")[shown]
-    rise = np.maximum(0.0, q[:, 2] - q[0, 2])
-    looks = np.column_stack([ahead, 0 * rise, 0.85 * q[0, 2] + 0.35 * rise])
+    way = trace(robot, motion.q[shown])
+    looks, distance_m = _camera(way, rate)
+    pressed = ground_forces(whole, rate, way, scene) if forces else None
+    size = KINDS[kind][1]
     pictures = []
-    name, renderer = _renderer(_world(robot, scene or Scene.flat()), KINDS[kind][1])
+    name, renderer = _renderer(_world(robot, scene, _marks(robot, way)), size)
     with renderer:
-        rows = zip(motion.t, trace(robot, q).joints, looks, motion.phase, strict=False)
-        for k, (t, poses, look, phase) in enumerate(rows, start=1):
-            tell("drawing frame", k, len(q))
-            picture = Image.fromarray(_draw(renderer, poses, look, str(phase)))
-            words = f"{t - motion.t[0]:.2f} s  (half speed)"
-            ImageDraw.Draw(picture).text((10, picture.height - 22), words, fill=INK)
+        for k, look in enumerate(looks):
+            tell("drawing frame", k + 1, len(looks))
+            arrows = () if pressed is None else _arrows(pressed[k], robot)
+            view = _camera_at(look, distance_m)
+            phase = str(motion.phase[k])
+            picture = Image.fromarray(_draw(renderer, way.joints[k], view, phase, arrows))
+            picture = picture.reduce(FINER)
+            words = f"{motion.t[k] - motion.t[0]:.2f} s, half speed"
+            ImageDraw.Draw(picture).text((10, size[1] - 22), words, fill=INK)
             pictures.append(picture)
-    return Movie(_encode(pictures, kind), kind, len(q), len(q) / RATES[kind], name)
+    count = len(pictures)
+    return Movie(_encode(pictures, kind), kind, count, count / RATES[kind], name)
+
+
+def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Scene]:
+    """The robot, its record and the ground of a movie."""
+    if isinstance(of, Robot):
+        if record is None:
+            raise InputError("a movie of a robot needs its record, a tape or a simulation")
+        return of, record, scene or Scene.flat()
+    if record is not None:
+        raise InputError("a movie of a plan or a simulation takes no other record; leave it away")
+    if isinstance(of, JumpPlan):
+        return of.robot, of.tape, scene or Scene.of_plan(of.summary, of.robot)
+    if of.robot is None:
+        raise InputError("the robot of this simulation is not known; give it, then the simulation")
+    ground = of.settings.get("ground")
+    return of.robot, of, scene or (Scene.from_json(ground) if ground else Scene.flat())
+
+
+def _camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
+    """Where the camera looks (n, 3) [m] along the way, and its distance [m]; it stands still unless
+    the jump is long.
+    """
+    base = way.joints[:, 0, :2]
+    height = way.joints[..., 2].max(axis=1)  # of the highest joint
+    top = height.max() + HEAD * height[0]
+    low = way.joints[..., 2].min() - LOW * height[0]
+    looks = np.empty((len(base), 3))
+    looks[:, :2] = (base.min(axis=0) + base.max(axis=0)) / 2
+    looks[:, 2] = (top + low) / 2
+    long = np.ptp(base[:, 0])
+    if long > FIXED_M:
+        width = max(1, round(GLIDE_S * rate_hz)) | 1
+        looks[:, :2] = uniform_filter1d(base, width, axis=0, mode="nearest")
+        long = 0.0
+    wide, high = KINDS["gif"][1]
+    half = max(top - low, (long + AROUND * height[0]) * high / wide) / 2
+    return looks, half / np.tan(np.radians(OPENING_DEG) / 2)
+
+
+def _marks(robot: Robot, way: Trace) -> tuple[float, float]:
+    """Where the toes are first and last, along x [m]."""
+    toes = (way.feet @ [*robot.foot.tip, 1.0])[..., 0].mean(axis=1)
+    return float(toes[0]), float(toes[-1])
+
+
+def _arrows(pressed: np.ndarray, robot: Robot) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Ends of the arrows of both feet [m], from places and forces (2, 6) [m, N]."""
+    scale = ARROW_M / (robot.total_mass * robot.gravity)
+    return [(x[:3], x[:3] + scale * x[3:]) for x in pressed if np.isfinite(x).all()]
 
 
 def write_movie(
@@ -143,7 +226,7 @@ def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> tuple[str, mujoco
         try:
             # else chosen by an environment variable that is read when MuJoCo is imported
             gl_context.GLContext = import_module(f"mujoco.{library}").GLContext
-            return name, mujoco.Renderer(model, size[1], size[0])
+            return name, mujoco.Renderer(model, FINER * size[1], FINER * size[0])
         except Exception as e:  # drivers that are not there fail in many ways
             failures.append(f"{name} ({type(e).__name__})")
     raise InputError(
@@ -151,8 +234,25 @@ def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> tuple[str, mujoco
     )
 
 
-def _draw(renderer: mujoco.Renderer, poses: np.ndarray, look: np.ndarray, phase: str) -> np.ndarray:
-    """Pixels (h, w, 3) of the joints at ``poses`` (njoints - 1, 7), seen at ``look`` (3,) [m]."""
+def _camera_at(look: np.ndarray, distance_m: float) -> mujoco.MjvCamera:
+    import mujoco
+
+    camera = mujoco.MjvCamera()
+    camera.distance = distance_m
+    camera.azimuth = AZIMUTH_DEG
+    camera.elevation = TILT_DEG
+    camera.lookat = look
+    return camera
+
+
+def _draw(
+    renderer: mujoco.Renderer,
+    poses: np.ndarray,
+    camera: mujoco.MjvCamera,
+    phase: str,
+    arrows: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> np.ndarray:
+    """Pixels (h, w, 3) of the joints at ``poses`` (njoints - 1, 7), and of arrows [m]."""
     import mujoco
 
     model = renderer.model
@@ -162,24 +262,35 @@ def _draw(renderer: mujoco.Renderer, poses: np.ndarray, look: np.ndarray, phase:
     data.mocap_pos = poses[:, :3]
     data.mocap_quat = poses[:, [6, 3, 4, 5]]
     mujoco.mj_forward(model, data)
-    camera = mujoco.MjvCamera()
-    camera.distance = VIEW_M
-    camera.azimuth = AZIMUTH_DEG
-    camera.elevation = TILT_DEG
-    camera.lookat = look
     renderer.update_scene(data, camera)
+    scene = renderer.scene
+    kind = mujoco.mjtGeom.mjGEOM_ARROW
+    for start, end in arrows:
+        arrow = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(arrow, kind, np.zeros(3), np.zeros(3), np.zeros(9), ARROW_RGBA)
+        mujoco.mjv_connector(arrow, kind, ARROW_RADIUS_M, start, end)
+        scene.ngeom += 1
     return renderer.render()
 
 
-def _world(robot: Robot, scene: Scene) -> mujoco.MjModel:
-    """Sky and light of ``world.xml``, the ground, and the robot's parts on a body per joint."""
+def _world(robot: Robot, scene: Scene, marks_m: Sequence[float] = ()) -> mujoco.MjModel:
+    """Sky and light of ``world.xml``, the ground with lines across, and the robot's parts on a body
+    per joint.
+    """
     import mujoco
 
     text = (resources.files("jumplab.show") / "world.xml").read_text(encoding="utf-8")
     spec = mujoco.MjSpec.from_string(text)
+    box = mujoco.mjtGeom.mjGEOM_BOX
     for half, middle, turn in scene.within(*SHOWN_M, 4.0).boxes():
         place = dict(size=half, pos=middle, quat=np.roll(turn, 1))
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, material="floor", **place)
+        spec.worldbody.add_geom(type=box, material="floor", **place)
+    if marks_m:
+        counts = np.arange(*np.round(np.array(SHOWN_M) / LINE_M))
+        lines = [(marks_m[0] + LINE_M * k, 0.0, LINE_RGBA) for k in counts]
+        for x, lift, color in [*lines, *((x, 0.001, MARK_RGBA) for x in marks_m)]:
+            at = [x, 0.0, scene.top_at(x) + lift]
+            spec.worldbody.add_geom(type=box, size=LINE_HALF_M, pos=at, rgba=color)
     bodies = [spec.worldbody.add_body(mocap=True) for _ in range(1, robot.model.njoints)]
     for number, part in enumerate(parts_of(robot)[0]):
         surface = dict(uservert=part.points.ravel(), userface=part.triangles.ravel())

@@ -2,13 +2,20 @@
 "use strict";
 const INK = "#222222", MARK = "#D55E00", ARROW = "#B3125F", GHOST = 0.35; // GHOST: opacity of the plan beside the simulation
 const ROLES = { hip: INK, knee: MARK, ankle: "#9C5480" }; // not the colours of the phases, which lie behind
-// in the order of the values of a clip, after travel of the toes and rise of the CoM
-const CURVES = [
-  { title: "CoM height", unit: "m", limit: null, lines: { "": INK } },
-  { title: "left angle", unit: "°", limit: null, lines: ROLES },
-  { title: "torque / limit", unit: "", limit: 1, lines: ROLES },
-  { title: "ground force / weight", unit: "", limit: null, lines: { "": INK } },
-];
+// the values of a clip: travel of the toes, rise of the CoM, these curves, then angle and torque of every joint
+const TRAVEL = 0, RISE = 1, HEIGHT = 2, ANGLES = 3, TORQUES = 6, FORCE = 9, JOINTS = 10;
+const columns = JOINTS + 2 * facts.joints.length;
+const of = (names, first, step) => names.map(([name, color], k) => ({ name, color, column: first + step * k }));
+const curves = (joint) => { // of hip, knee and ankle, or of the joint with this number
+  const names = joint < 0 ? Object.entries(ROLES) : [["", MARK]], [angle, torque] = joint < 0 ? [ANGLES, TORQUES] : [JOINTS + 2 * joint, JOINTS + 2 * joint + 1];
+  const whose = joint < 0 ? "left" : facts.joints[joint].replaceAll("_", " ");
+  return [
+    { title: "CoM height", unit: "m", limit: null, lines: of([["", INK]], HEIGHT, 1) },
+    { title: `${whose} angle`, unit: "°", limit: null, lines: of(names, angle, 1) },
+    { title: joint < 0 ? "torque / limit" : "its torque / limit", unit: "", limit: 1, lines: of(names, torque, 1) },
+    { title: "ground force / weight", unit: "", limit: null, lines: of([["", INK]], FORCE, 1) },
+  ];
+};
 const byId = (name) => document.getElementById(name);
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
 const stage = byId("stage"), viewer = new MeshCat.Viewer(byId("pane"));
@@ -37,7 +44,7 @@ const clips = facts.clips.map((clip) => ({
   aside: 0,
   duration: (clip.frames - 1) / facts.fps,
 }));
-let duration = 0, now = 0, playing = false, before = 0, lead = clips[0];
+let duration = 0, now = 0, playing = false, before = 0, undrawn = 0, lead = clips[0], plots = [];
 
 const point = (poses, k) => new Vector3().fromArray(poses, k);
 const turn = (poses, k) => new Quaternion().fromArray(poses, k + 3);
@@ -49,7 +56,6 @@ function frames(clip, time) {
   const at = Math.min(time, clip.duration) * facts.fps, low = Math.min(Math.floor(at + 1e-9), clip.frames - 1);
   return [low, Math.min(low + 1, clip.frames - 1), Math.max(0, at - low)];
 }
-const columns = 2 + CURVES.reduce((sum, { lines }) => sum + Object.keys(lines).length, 0);
 function value(clip, column, time) {
   const [low, high, u] = frames(clip, time), at = (k) => clip.values[columns * k + column];
   return at(low) + u * (at(high) - at(low));
@@ -93,7 +99,7 @@ for (const clip of clips) {
   clip.paints = Object.fromEntries(["trunk", "limb", "rest"].map((kind) => [kind, dull({ flatShading: parts.some((p) => p.faceted) })]));
   clip.joints = Array.from({ length: clip.bodies }, () => add(clip.group, new Group(), [0, 0, 0]));
   for (const { joint, kind, shape } of parts) add(clip.joints[joint], new Mesh(shape, clip.paints[kind]), [0, 0, 0]);
-  const bead = new SphereGeometry(0.007, 12, 8), landing = clip.phases.findLast(([, phase]) => phase === "landing");
+  const bead = new SphereGeometry(0.007, 12, 8), landing = clip.phases.filter(([, phase]) => phase === "landing").at(-1); // of a chain the last one
   let last = new Vector3(Infinity, 0, 0);
   for (let k = 0; k < clip.frames && k / facts.fps < (landing ? landing[0] + 0.6 : Infinity); k++) { // later it hardly moves
     const place = point(clip.path, 3 * k);
@@ -169,7 +175,7 @@ function seek(time) {
 const said = (x, digits) => x.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−"); // never "−0.0"
 
 // plan and simulation in figures, as long as both last
-const ROWS = [["travel of the toes", 0], ["CoM over take-off", 1]];
+const ROWS = [["travel of the toes", TRAVEL], ["CoM over take-off", RISE]];
 function compare() {
   const [simulation, plan] = ["simulation", "plan"].map((name) => clips.find((clip) => clip.name === name));
   if (!simulation || !plan) return;
@@ -214,23 +220,22 @@ function choose() {
 }
 
 // curves, with the phases behind them
-const lines = (curve) => Object.entries(curve.lines);
-const plots = CURVES.map((curve, i) => {
-  const first = 2 + CURVES.slice(0, i).reduce((sum, { lines }) => sum + Object.keys(lines).length, 0);
+const plot_of = (curve) => {
   const [card, title, plot, canvas, cursor] = ["div", "h2", "div", "canvas", "div"].map((tag) => document.createElement(tag));
   title.append(curve.title + (curve.unit && ` [${curve.unit}]`));
-  const numbers = lines(curve).map(([name, color]) => {
+  const numbers = curve.lines.map(({ name, color, column }) => {
     const number = document.createElement("b");
     number.style.color = color;
     title.append(number, " "); // so that a line can break between them
-    return { name, number, digits: curve.unit === "°" ? 0 : 2 };
+    return { name, number, column, digits: curve.unit === "°" ? 0 : 2 };
   });
   plot.className = "plot";
   cursor.className = "cursor";
   plot.append(canvas, cursor);
   card.append(title, plot);
   byId("curves").append(card);
-  const seen = clips.flatMap((clip) => [...clip.values].filter((_, k) => k % columns >= first && k % columns < first + numbers.length));
+  const used = new Set(numbers.map(({ column }) => column));
+  const seen = clips.flatMap((clip) => [...clip.values].filter((_, k) => used.has(k % columns)));
   const finite = seen.filter(isFinite).sort((a, b) => a - b);
   if (!finite.length) card.style.display = "none";
   let [low, high] = [finite[0], finite.at(-1)];
@@ -260,19 +265,24 @@ const plots = CURVES.map((curve, i) => {
     for (const clip of clips.filter(shown)) {
       pen.setLineDash(ghosted(clip) ? [4, 3] : []);
       pen.lineWidth = 1.5;
-      lines(curve).forEach(([, color], n) => {
+      curve.lines.forEach(({ color, column }) => {
         pen.strokeStyle = color;
-        line(Array.from({ length: clip.frames }, (_, k) => [x(k / facts.fps), y(clip.values[columns * k + first + n])]));
+        line(Array.from({ length: clip.frames }, (_, k) => [x(k / facts.fps), y(clip.values[columns * k + column])]));
       });
     }
   }
   function point() {
     cursor.style.left = `${(100 * now) / duration}%`;
-    for (const [n, { name, number, digits }] of numbers.entries())
-      number.textContent = `${name} ${said(value(lead, first + n, now), digits)}`;
+    for (const { name, number, column, digits } of numbers)
+      number.textContent = `${name} ${said(value(lead, column, now), digits)}`;
   }
   return { draw, point };
-});
+};
+function plot() {
+  byId("curves").replaceChildren();
+  plots = curves(Number(byId("joint").value)).map(plot_of);
+  for (const one of plots) { one.draw(); one.point(); }
+}
 
 // the camera: the whole jump, whatever the shape of the window
 const middle = [(facts.view.x[0] + facts.view.x[1]) / 2, (facts.view.z[0] + facts.view.z[1]) / 2, 0]; // y points up
@@ -320,11 +330,19 @@ const labels = facts.ruler.map(({ at, text }) => {
   byId("labels").append(span);
   return { at, span };
 });
+// the names of plan and simulation above their heads, where they stand apart
+const names = clips.length < 2 ? [] : clips.map((clip) => {
+  const span = document.createElement("span");
+  span.textContent = clip.name;
+  byId("labels").append(span);
+  return { clip, span };
+});
 function place_labels() {
   viewer.camera.updateMatrixWorld();
-  for (const { at, span } of labels) {
+  const above = names.map(({ clip, span }) => ({ at: base(clip, now).add(new Vector3(0, 0, 0.5)).toArray(), span, apart: clip.aside }));
+  for (const { at, span, apart = true } of [...labels, ...above]) {
     const p = upright(new Vector3(...at)).project(viewer.camera);
-    span.style.display = p.z < 1 ? "" : "none"; // not behind the camera
+    span.style.display = p.z < 1 && apart ? "" : "none"; // not behind the camera
     span.style.left = `${((p.x + 1) / 2) * stage.clientWidth}px`;
     span.style.top = `${((1 - p.y) / 2) * stage.clientHeight}px`;
   }
@@ -334,12 +352,16 @@ const pressed = (name) => byId(name).getAttribute("aria-pressed") === "true";
 function play(yes) {
   if (yes && now >= duration) now = 0;
   playing = yes;
-  before = performance.now();
+  undrawn = 2; // the clock starts when the first frames are drawn, which may take a second
   byId("play").textContent = yes ? "❚❚" : "▶";
 }
 
+const step = (frames) => { play(false); seek((Math.round(now * facts.fps) + frames) / facts.fps); };
 function tick(instant) {
-  if (playing) {
+  if (playing && undrawn > 0) {
+    undrawn -= 1;
+    before = instant;
+  } else if (playing) {
     seek(now + (Math.max(0, instant - before) / 1000) * Number(byId("speed").value));
     before = instant;
     if (now >= duration && pressed("loop")) now = 0;
@@ -353,6 +375,18 @@ byId("title").textContent = facts.title;
 byId("note").textContent = `${clips.map((clip) => clip.name).join(" and ")} · ${facts.note} · drag to turn, wheel to zoom`;
 byId("time").addEventListener("input", (e) => { play(false); seek(Number(e.target.value)); });
 byId("play").addEventListener("click", () => play(!playing));
+byId("back").addEventListener("click", () => step(-1));
+byId("on").addEventListener("click", () => step(1));
+byId("joint").append(new Option("hip, knee, ankle", -1), ...facts.joints.map((name, k) => new Option(name.replaceAll("_", " "), k)));
+byId("joint").addEventListener("change", plot);
+for (const [name, color] of [...Object.entries(facts.css).filter(([name]) => clips.some((clip) => clip.phases.some(([, phase]) => phase === name))), ["force of the ground, CoP", ARROW]]) {
+  if (color === ARROW && clips.every(({ forces }) => !forces)) continue;
+  const [entry, dot] = [document.createElement("span"), document.createElement("i")];
+  dot.style.background = color;
+  entry.append(dot, name);
+  byId("legend").append(entry);
+}
+if (clips.length > 1) byId("legend").append("pale, dashed: the plan beside the simulation");
 byId("view").addEventListener("change", look);
 byId("loop").addEventListener("click", () => byId("loop").setAttribute("aria-pressed", !pressed("loop")));
 byId("follow").addEventListener("click", () => follow(!following));
@@ -361,16 +395,27 @@ for (const name of [...clips.map((clip) => clip.name), ...(clips.length > 1 ? ["
   byId("show").append(new Option(name, name));
 byId("show").addEventListener("change", choose);
 if (clips.length < 2) for (const name of ["show", "beside"]) byId(name).style.display = "none";
-addEventListener("keydown", (e) => { if (e.code === "Space" && e.target === document.body) { e.preventDefault(); play(!playing); } });
+const KEYS = { Space: () => play(!playing), ArrowLeft: () => step(-1), ArrowRight: () => step(1), Home: () => { play(false); seek(0); }, End: () => { play(false); seek(duration); } };
+addEventListener("keydown", (e) => {
+  if (!KEYS[e.code] || /^(INPUT|SELECT)$/.test(e.target.tagName) || (e.code === "Space" && e.target !== document.body)) return;
+  e.preventDefault();
+  KEYS[e.code]();
+});
 addEventListener("resize", () => { viewer.set_3d_pane_size(); look(); for (const plot of plots) plot.draw(); });
 
-// jump.html#t=0.95&view=corner&show=both opens still, at that instant; &follow=1 with the robot in the middle
+// jump.html#t=0.95&view=corner&show=both opens paused, at that instant; &follow=1 with the robot in the middle
 const asked = new URLSearchParams(location.hash.slice(1));
 for (const name of ["view", "show"])
   if ([...byId(name).options].some((o) => o.value === asked.get(name))) byId(name).value = asked.get(name);
 viewer.set_3d_pane_size();
 choose();
+plot();
 seek(Number(asked.get("t")) || 0);
 follow(asked.has("follow") ? asked.get("follow") === "1" : stage.clientWidth < 0.9 * stage.clientHeight); // as on a phone
-if (!asked.has("t")) play(true);
+if (!asked.has("t")) // it starts when it is seen: in a notebook, it may be far below
+  new IntersectionObserver((entries, watch) => {
+    if (!entries.some((entry) => entry.isIntersecting)) return;
+    watch.disconnect();
+    play(true);
+  }).observe(stage);
 requestAnimationFrame(tick);

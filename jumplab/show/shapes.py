@@ -1,4 +1,4 @@
-"""What a robot looks like in 3-D: meshes of published robots, made coarser, or a rounded body
+"""The shape of a robot in pictures: meshes of published robots, made coarser, or a rounded body
 around its boxes.
 
 Nothing here is simulated or planned with: shapes that collide stay boxes.
@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial import ConvexHull
 
 from jumplab.errors import RobotError
+from jumplab.io.motion import CONTACT_FORCE_N, Motion
 from jumplab.robot import Robot
 from jumplab.robot.files import LEG, SHIPPED
 from jumplab.robot_import.checkup import examine
 from jumplab.show.style import PHASE_COLORS, tint
+from jumplab.sim.scene import Scene
 
 LIMB_SHARE = 0.5  # strength of a colour on limbs, whose trunk has all of it
 REST_COLOR = "#42474F"  # feet and joints, whose colour stays
@@ -34,12 +37,20 @@ CELL_M = 0.003
 COARSER = 1.3
 ORIGIN = re.compile(r"lumped by jumplab from a URDF with the SHA-256\n# ([0-9a-f]{64})")
 # the body that is drawn where there are no meshes; none of these numbers is the robot's
-LIMB_M = 0.04  # radius of limbs
-JOINT_M = 0.045  # radius of the balls at the joints
-ROUNDING = 0.2  # radius of the edges of boxes, in the least width
+LIMB_M = 0.04  # radius of a limb that has no box
+END_SHARE = 0.45  # radius of a limb's ends, in the least width of its box
+JOINT_M = np.array([0.042, 0.047, 0.042])  # half sizes of the discs at the joints, about y
+FEET_SHARE = 0.75  # of these sizes at the ankles
+# radii of the edges of boxes, in the least width: of soles, and of all others
+SOLE_ROUNDING = 0.2
+ROUNDING = 0.4
+HEAD_ROUNDING = 0.5
+# the dark front of a head, in half sizes of its box: middle and half sizes
+VISOR = np.array([[0.62, 0.0, 0.2], [0.45, 0.8, 0.3]])
 _CIRCLE = np.exp(1j * np.arange(16) * np.pi / 8)
 _HEIGHTS = np.exp(1j * np.linspace(-np.pi / 2, np.pi / 2, 9))
 BALL = np.array([(a.real * h.real, a.imag * h.real, h.imag) for h in _HEIGHTS for a in _CIRCLE])
+DISC = np.array([(a.real, side, a.imag) for side in (-1.0, 1.0) for a in _CIRCLE])
 
 
 @dataclass(frozen=True)
@@ -56,8 +67,7 @@ class Part:
 def parts_of(robot: Robot) -> tuple[list[Part], list[str]]:
     """The parts of a robot, and what there is to say of where they come from."""
     meshes, notes = _published(robot)
-    boxes = [] if meshes else rounded_boxes(robot)
-    return meshes or [*boxes, *_skeleton(robot, boxes)], notes
+    return meshes or rounded_body(robot), notes
 
 
 class Trace(NamedTuple):
@@ -97,6 +107,24 @@ def pressure_points(
     x = feet[..., 0] - (wrench[..., 4] + above * wrench[..., 0]) / pressed
     y = feet[..., 1] + (wrench[..., 3] - above * wrench[..., 1]) / pressed
     return np.stack([x, y, height + 0 * pressed], axis=-1)
+
+
+def ground_forces(whole: Motion, rate_hz: float, way: Trace, scene: Scene) -> np.ndarray | None:
+    """Where the ground presses on each foot, and with which force (N, 2, 6) [m, N], at ``rate_hz``
+    along the ``way``.
+
+    NaN where it does not; None if nothing is known of it. The force is the mean from frame to
+    frame, as that of an impact depends on the engine's step.
+    """
+    if whole.wrench is None:
+        return None
+    rows = max(1, round(len(whole.t) / (whole.duration * rate_hz)))
+    mean = replace(whole, wrench=uniform_filter1d(whole.wrench, rows, axis=0, mode="nearest"))
+    wrench = mean.every(rate_hz).wrench[: len(way.feet)]
+    feet = way.feet[..., :3, 3]
+    top = np.vectorize(scene.top_at, otypes=[float])(feet[..., 0])
+    places = pressure_points(wrench, feet, top, CONTACT_FORCE_N)
+    return np.concatenate([places, np.where(np.isnan(places), np.nan, wrench[..., :3])], axis=-1)
 
 
 # meshes
@@ -149,10 +177,29 @@ def _kind(robot: Robot, joint: int) -> str:
     return "trunk" if joint == 1 else "rest" if joint in feet else "limb"
 
 
-# boxes, and what is drawn between them
+# a body around boxes
 # ----------------------------------------------------------------------------------------------
-def rounded_boxes(robot: Robot) -> list[Part]:
-    """The boxes around the shapes of a robot's URDF, with round edges; none if these are meshes.
+class _Box(NamedTuple):
+    joint: int
+    middle: np.ndarray  # (3,) in the joint's frame [m]
+    turn: np.ndarray  # (3, 3)
+    half: np.ndarray  # (3,) [m]
+
+    def rounded(self, share: float) -> np.ndarray:
+        """Points (n, 3) of the box, the radius of its edges a ``share`` of the least width."""
+        radius = share * 2 * self.half.min()
+        inner = zip(radius - self.half, self.half - radius, strict=True)
+        corners = np.array(list(itertools.product(*inner)))
+        points = (corners[:, None] + radius * BALL).reshape(-1, 3)
+        return points @ self.turn.T + self.middle
+
+    def inside(self, share: np.ndarray) -> np.ndarray:
+        """Points (n, 3) given in half sizes of the box."""
+        return (share * self.half) @ self.turn.T + self.middle
+
+
+def _boxes(robot: Robot) -> list[_Box]:
+    """The boxes around the shapes of a robot's URDF; none if these are meshes.
 
     Raises :class:`RobotError` if Pinocchio cannot read the shapes.
     """
@@ -164,37 +211,102 @@ def rounded_boxes(robot: Robot) -> list[Part]:
             return []
         reason = str(e).splitlines()[0]
         raise RobotError(f"robot {robot.name}: Pinocchio cannot read its shapes: {reason}") from e
-    parts = []
+    boxes = []
     for shape in geometry.geometryObjects:
         shape.geometry.computeLocalAABB()
         box = shape.geometry.aabb_local
-        radius = ROUNDING * min(box.max_ - box.min_)
-        ends = zip(box.min_ + radius, box.max_ - radius, strict=True)
-        corners = np.array(list(itertools.product(*ends)))
-        points = (corners[:, None] + radius * BALL).reshape(-1, 3)
         place = shape.placement
-        moved = points @ place.rotation.T + place.translation
-        parts.append(_hull(shape.parentJoint, _kind(robot, shape.parentJoint), moved))
-    return parts
+        middle = place.act((box.max_ + box.min_) / 2)
+        boxes.append(_Box(shape.parentJoint, middle, place.rotation, (box.max_ - box.min_) / 2))
+    return boxes
 
 
-def _skeleton(robot: Robot, boxes: list[Part]) -> Iterator[Part]:
-    """What holds the boxes together: through the trunk, from joint to joint of a leg, and balls."""
+def rounded_body(robot: Robot) -> list[Part]:
+    """A body around the boxes of a robot's URDF: limbs that reach from joint to joint, a trunk that
+    holds them, discs at the joints that move. All parts are convex.
+
+    Raises :class:`RobotError` if Pinocchio cannot read the shapes.
+    """
     model = robot.model
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
-    middles = [part.points.mean(axis=0) for part in boxes if part.joint == 1]
-    if middles:
-        yield _hull(1, "trunk", np.concatenate([x + LIMB_M * BALL for x in middles]))
-    joints = {role: [model.getJointId(n) for n in pair] for role, pair in robot.joints.items()}
-    for upper, lower in itertools.pairwise(LEG):
-        for start, end in zip(joints[upper], joints[lower], strict=True):
-            carrier = model.parents[end]
-            place = data.oMi[carrier]
-            ends = [place.actInv(data.oMi[joint].translation) for joint in (start, end)]
-            yield _hull(carrier, "limb", np.concatenate([x + LIMB_M * BALL for x in ends]))
-    for joint in itertools.chain(*joints.values()):
-        yield _hull(joint, "rest", JOINT_M * BALL)
+    boxes: dict[int, list[_Box]] = {}
+    for box in _boxes(robot):
+        boxes.setdefault(box.joint, []).append(box)
+    for role in LEG[1:]:  # thighs and shanks are drawn even without boxes
+        for name in robot.joints[role]:
+            boxes.setdefault(model.parents[model.getJointId(name)], [])
+    # a joint without a box is drawn with the next one below that has one, or with its parent
+    ends = _ends(model, boxes.keys())
+    parts = []
+    for joint, own in boxes.items():
+        kind = _kind(robot, joint)
+        if kind == "trunk":
+            continue
+        radius = END_SHARE * min((2 * box.half.min() for box in own), default=2 * LIMB_M)
+        radius = max(radius, END_SHARE * LIMB_M)
+        rounding = SOLE_ROUNDING if kind == "rest" else ROUNDING
+        balls = [
+            data.oMi[joint].actInv(data.oMi[end].translation) + radius * BALL
+            for end in {joint, *ends[joint]}
+        ]
+        solid = np.concatenate([*(box.rounded(rounding) for box in own), *balls])
+        parts.append(_hull(joint, kind, solid))
+    return [*parts, *_trunk(robot, data, boxes.get(1, [])), *_discs(robot)]
+
+
+def _ends(model: pin.Model, drawn: Collection[int]) -> dict[int, list[int]]:
+    """Joints where a drawn one's limb ends: those above it that are not drawn, up to the trunk, and
+    those that it carries.
+    """
+    ends: dict[int, list[int]] = {joint: [] for joint in drawn}
+    for joint in range(2, model.njoints):
+        below = next((j for j in model.subtrees[joint] if j in ends), None)
+        if joint not in ends and below is not None:
+            ends[below].append(joint)
+        above = model.parents[joint]
+        if above in ends:
+            ends[above].append(joint)
+    return ends
+
+
+def _trunk(robot: Robot, data: pin.Data, boxes: list[_Box]) -> Iterator[Part]:
+    """Its boxes, what holds them together, bars between hips and between shoulders, and a face."""
+    model = robot.model
+    if not boxes:
+        return
+    limbs = dict.fromkeys(  # the joints of left and right at which they leave the trunk
+        tuple(model.supports[model.getJointId(name)][2] for name in pair)
+        for pair in robot.joints.values()
+        if pair
+    )
+    bars = [[data.oMi[1].actInv(data.oMi[joint].translation) for joint in pair] for pair in limbs]
+    shoulders = max(bar[0][2] for bar in bars)
+    top = max(boxes, key=lambda box: box.middle[2])
+    above = top.middle[2] - top.half[2] > shoulders - LIMB_M
+    has_head = above and top.half.prod() < max(box.half.prod() for box in boxes)
+    middles = [box.middle for box in boxes]
+    yield _hull(1, "trunk", np.concatenate([x + LIMB_M * BALL for x in middles]))
+    for box in boxes:
+        head = has_head and box is top
+        yield _hull(1, "trunk", box.rounded(HEAD_ROUNDING if head else ROUNDING))
+    for bar in bars:
+        solid = [x + LIMB_M * BALL for x in bar]
+        near = min(boxes, key=lambda box: np.linalg.norm(box.middle - np.mean(bar, axis=0)))
+        if near.half[1] < abs(bar[0][1]) / 2:  # a waist, which widens to the hips
+            solid.append(near.rounded(ROUNDING))
+        yield _hull(1, "trunk", np.concatenate(solid))
+    if has_head:
+        middle, half = VISOR
+        yield _hull(1, "rest", top.inside(middle + half * BALL))
+
+
+def _discs(robot: Robot) -> Iterator[Part]:
+    """A disc about y at each joint with a role."""
+    for role, pair in robot.joints.items():
+        size = JOINT_M * (FEET_SHARE if role == LEG[-1] else 1.0)
+        for name in pair:
+            yield _hull(robot.model.getJointId(name), "rest", size * DISC)
 
 
 def _hull(joint: int, kind: str, points: np.ndarray) -> Part:

@@ -7,14 +7,18 @@ closed.
 
 from __future__ import annotations
 
+import base64
+import html
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ContextDecorator, ExitStack
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import rc_context, rc_params_from_file, rcParams, rcParamsDefault
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import is_color_like, to_rgb
@@ -50,6 +54,9 @@ LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}  # a bound
 BAND = (0.928, 0.928, 0.928)  # fill of what is allowed between two bounds
 # keywords of Axes.annotate
 NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}
+# of the style, in points: they grow with a font.size of the user's
+TEXT_SIZES = [f"{of}.labelsize" for of in ("axes", "xtick", "ytick")]
+TEXT_SIZES += ["axes.titlesize", "legend.fontsize"]
 STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
 
 
@@ -59,31 +66,83 @@ def use_style() -> None:
     show_waiting()
 
 
-# decorator or ``with`` block: the style, whatever the caller's settings are
-styled = plt.style.context(STYLE_FILE)
+class Style(ContextDecorator):
+    """The style, as a decorator or in a ``with`` block.
+
+    ``whole`` whatever the caller's settings are, else with those that differ from Matplotlib's
+    defaults left as they are.
+    """
+
+    def __init__(self, whole: bool):
+        self._whole = whole
+        self._open: list[ExitStack] = []
+
+    def __enter__(self) -> None:
+        own = {} if self._whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
+        stack = ExitStack()
+        stack.enter_context(plt.style.context(STYLE_FILE))
+        larger = own.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
+        for key in (key for key in TEXT_SIZES if key not in own):
+            rcParams[key] *= larger
+        rcParams.update(own)
+        self._open.append(stack)
+
+    def __exit__(self, *exc: Any) -> None:
+        self._open.pop().close()
+
+
+def _ours() -> dict[str, Any]:
+    """Values now of the settings that the style has."""
+    return {
+        key: rcParams[key] for key in rc_params_from_file(STYLE_FILE, use_default_template=False)
+    }
+
+
+styled = Style(whole=True)
+themed = Style(whole=False)  # for pictures of results: the user's style wins
 
 
 class Picture(Figure):
-    """A figure that shows itself in a notebook, whatever backend is chosen there."""
+    """A figure that a notebook shows, whatever backend is chosen there, with its caption if it has
+    one.
+    """
 
-    _saved = b""  # its PNG, see save_figure
+    caption = ""  # and its PNG, see save_figure
+    _saved = b""
 
-    @styled
-    def _repr_png_(self) -> bytes:
+    def __init__(self, *args: Any, **options: Any):
+        super().__init__(*args, **options)
+        self.settings = _ours()  # under which it is drawn later too
+
+    def png(self) -> bytes:
+        """The figure as a PNG."""
         if self._saved and not self.stale:
             return self._saved
         return _file_of(self, "png", dpi=self.get_dpi(), metadata=PNG_METADATA)
+
+    @property
+    def _repr_png_(self) -> Callable[[], bytes] | None:
+        return None if self.caption else self.png  # a notebook keeps one of both
+
+    def _repr_html_(self) -> str | None:
+        if not self.caption:
+            return None
+        words = html.escape(self.caption)
+        source = f"data:image/png;base64,{base64.b64encode(self.png()).decode()}"
+        image = f'<img src="{source}" alt="{words}" style="max-width: 100%">'
+        return f'<figure style="margin: 0">{image}<figcaption>{words}</figcaption></figure>'
 
 
 def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
     """A figure as a file of that kind; ``how`` are options of ``Figure.savefig``."""
     buffer = io.BytesIO()
-    fig.savefig(buffer, format=kind, **how)
+    with styled, rc_context(getattr(fig, "settings", {})):
+        fig.savefig(buffer, format=kind, **how)
     return buffer.getvalue()
 
 
 @checked
-@styled
+@themed
 def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
     """An empty figure of the style, ``width`` and ``height`` [in]."""
     if not (0 < width < PAGE_MOST_IN and 0 < height < PAGE_MOST_IN):
@@ -108,7 +167,7 @@ def shade(color: Color, share: float) -> tuple[float, float, float]:
 def _mixed(color: Color, share: float) -> tuple[float, float, float]:
     """(r, g, b) of a color of which there is to be a ``share``."""
     if not is_color_like(color):
-        raise InputError(f"color {quoted(color)}: Matplotlib knows none such")
+        raise InputError(f"color {quoted(color)}: Matplotlib has no such color")
     if not 0 <= share <= 1:
         raise InputError(f"a share of {share:g} of a color is outside 0 ... 1")
     return to_rgb(color)
@@ -201,7 +260,6 @@ def bare(ax: Axes) -> None:
 # saving
 # ----------------------------------------------------------------------------------------------
 @checked
-@styled
 def save_figure(
     fig: Figure,
     name: str,
@@ -214,10 +272,10 @@ def save_figure(
     """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into
     ``folder``.
 
-    The same figure gives the same bytes: the files carry neither dates nor versions of the software
-    that wrote them. It is laid out once, for the PNG; the PDF and what a notebook shows keep that
-    layout. Returns the figure. Raises :class:`InputError` if ``name`` is not a plain file name, or
-    the folder cannot be written.
+    A notebook shows the caption below the figure. The same figure gives the same bytes: the files
+    carry neither dates nor versions of the software that wrote them. It is laid out once, for the
+    PNG; the PDF and what a notebook shows keep that layout. Returns the figure. Raises
+    :class:`InputError` if ``name`` is not a plain file name, or the folder cannot be written.
     """
     if not name or Path(name).name != name or name.startswith("."):
         must = "must be a plain file name without ending, such as 'f08_joints'"
@@ -225,6 +283,7 @@ def save_figure(
     png = _file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
     fig.set_layout_engine("none")
     pdf = _file_of(fig, "pdf", metadata=PDF_METADATA)
+    fig.caption = caption.strip()
     fig._saved = png  # a notebook shows it without drawing it again ...
     fig.stale = False  # ... until it is changed
     text = caption_text(caption, task, robot).encode()

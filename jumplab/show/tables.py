@@ -15,6 +15,7 @@ from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.io import folder
 
+MOST_ROWS = 12  # of a table in a notebook; those below are folded
 DIGITS_MOST = 17  # a float has no more
 
 
@@ -39,8 +40,14 @@ class Table:
         cells = "".join(f'<td style="text-align:{side}">{{}}</td>' for side in sides)
         row = f"<tr>{cells}</tr>"
         head = row.replace("td", "th").format(*map(html.escape, self.columns))
-        body = "".join(row.format(*map(html.escape, line)) for line in self.rows)
-        return f"<table><thead>{head}</thead><tbody>{body}</tbody></table>"
+        lines = [row.format(*map(html.escape, line)) for line in self.rows]
+
+        def part(some: list[str]) -> str:
+            return f"<table><thead>{head}</thead><tbody>{''.join(some)}</tbody></table>"
+
+        rest = lines[MOST_ROWS:]
+        folded = f"<details><summary>{len(rest)} more rows</summary>{part(rest)}</details>"
+        return part(lines[:MOST_ROWS]) + folded * bool(rest)
 
 
 @checked

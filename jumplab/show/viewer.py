@@ -17,16 +17,15 @@ from string import Template
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.io.folder import write_file
-from jumplab.io.motion import CONTACT_FORCE_N, Motion, Record
+from jumplab.io.motion import Motion, Record
 from jumplab.robot import Robot
 from jumplab.robot.files import LEG
 from jumplab.show.bodies import ABOVE_M
-from jumplab.show.shapes import PAINTS, Part, Trace, parts_of, pressure_points, trace
+from jumplab.show.shapes import PAINTS, Part, Trace, ground_forces, parts_of, trace
 from jumplab.show.style import PHASE_COLORS, describe_task
 from jumplab.sim.scene import Scene
 from jumplab.task import GRAVITY, JumpTask
@@ -107,6 +106,7 @@ def page(
         "fps": FPS,
         "weight": robot.total_mass * GRAVITY,
         "parts": list(map(_part, parts)),
+        "joints": list(robot.joint_names),
         "clips": [
             {"name": name, **_clip(motion, robot, scene, ways[name])}
             for name, motion in motions.items()
@@ -154,17 +154,7 @@ def _ground(scene: Scene, span: tuple[float, float]) -> tuple[list[dict[str, Any
 def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, Any]:
     """What the page plays of a motion that goes this way."""
     motion = whole.every(FPS)
-    forces = None
-    if whole.wrench is not None:
-        # the mean from frame to frame, as the force of an impact depends on the engine's step
-        rows = max(1, round(len(whole.t) / (whole.duration * FPS)))
-        mean = replace(whole, wrench=uniform_filter1d(whole.wrench, rows, axis=0, mode="nearest"))
-        wrench = mean.every(FPS).wrench
-        feet = way.feet[..., :3, 3]
-        top = np.vectorize(scene.top_at, otypes=[float])(feet[..., 0])
-        places = pressure_points(wrench, feet, top, CONTACT_FORCE_N)
-        force = np.where(np.isnan(places), np.nan, wrench[..., :3])
-        forces = np.concatenate([places, force], axis=-1)
+    forces = ground_forces(whole, FPS, way, scene)
     words = [_words(*row) for row in zip(motion.phase, motion.contact, strict=True)]
     cuts = [k for k, word in enumerate(words) if k == 0 or word != words[k - 1]]
     return {
@@ -206,8 +196,9 @@ def _packed(values: np.ndarray) -> str:
 def _values(
     whole: Motion, motion: Motion, robot: Robot, way: Trace, forces: np.ndarray | None
 ) -> np.ndarray:
-    """What the page's table and curves show (N, 10): travel of the toes, rise of the CoM since
-    take-off [m], then the lines of the curves in ``player.js``.
+    """The values of table and curves (N, 10 + 2 joints): travel of the toes, rise of the CoM since
+    take-off [m], the lines of the curves in ``player.js``, then of each joint its angle [deg] and
+    its torque as a share of the limit.
     """
     height = way.com[:, 2]
     toes = (way.feet @ [*robot.foot.tip, 1.0])[..., 0].mean(axis=1)
@@ -216,6 +207,7 @@ def _values(
     names = robot.joint_names
     pairs = np.array([[names.index(name) for name in robot.joints[role]] for role in LEG])
     shares = np.abs(motion.tau) / [robot.actuators[name]["effort"] for name in names]
+    joints = np.stack([np.degrees(motion.q[:, 7:]), shares], axis=2).reshape(len(height), -1)
     push = np.full(len(height), np.nan) if forces is None else np.nansum(forces[..., 5], axis=1)
     return np.column_stack(
         [
@@ -225,5 +217,6 @@ def _values(
             np.degrees(motion.q[:, 7 + pairs[:, 0]]),
             shares[:, pairs].max(axis=2),
             push / (robot.total_mass * GRAVITY),
+            joints,
         ]
     )

@@ -69,7 +69,7 @@ class Finding:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Metrics:
+class Metrics(Shown):
     """Numbers of one run, all measured in the simulation; None where it did not get so far.
 
     Take-off is that of the flight that rises highest, touchdown the end of the last one. Loads are
@@ -123,6 +123,10 @@ class Metrics:
     recovery_step_s: Maybe = None
     qp_solves: int  # of the landing controller
     qp_failures: int
+
+    def line(self) -> str:
+        """The verdict."""
+        return self.reason
 
 
 @dataclass(frozen=True, repr=False)

@@ -12,7 +12,7 @@ import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError, Shown
-from jumplab.io.columns import Named
+from jumplab.io.columns import Named, Rows
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import Solution
 from jumplab.robot import Robot
@@ -144,12 +144,12 @@ class JumpPlan(Shown, Named):
         """One row per stage; stage 2's is called "2 joint map, gentle" where it had to follow less
         closely.
         """
-        return tuple(StageRow(**row) for row in self.summary["stages"])
+        return Rows(StageRow(**row) for row in self.summary["stages"])
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
         """Starts of the whole-body program that were tried, what they took, and how they ended."""
-        return tuple(Attempt(**row) for row in self.summary.get("attempts", ()))
+        return Rows(Attempt(**row) for row in self.summary.get("attempts", ()))
 
     @property
     def skipped(self) -> str | None:
@@ -224,8 +224,8 @@ class JumpPlan(Shown, Named):
         """
         return self.summary["manifest"]["solvers"]
 
-    def terms(self) -> list[dict[str, Any]]:
-        """All terms and bounds of the stages as solved; ``jl.plots.table`` shows them.
+    def terms(self) -> Rows:
+        """All terms and bounds of the stages as solved; a notebook shows them as a table.
 
         Returns
         -------
@@ -235,7 +235,7 @@ class JumpPlan(Shown, Named):
         """
         rows = [] if self.srmp is None else _terms(self.srmp.solution)
         rows += [] if self.joints is None else self.joints.problem.table()
-        return rows + ([] if self.whole_body is None else _terms(self.whole_body.solution))
+        return Rows(rows + ([] if self.whole_body is None else _terms(self.whole_body.solution)))
 
 
 def make_tape(body: WholeBodyPlan, srmp: SrmpPlan | None = None) -> Tape:

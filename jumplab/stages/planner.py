@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from jumplab.arguments import checked
-from jumplab.errors import InputError, SolverError, quoted, require_type
+from jumplab.errors import InputError, Shown, SolverError, quoted, require_type
+from jumplab.io.columns import Rows
 from jumplab.models.full import FullBody
 from jumplab.ocp import Problem, Term
 from jumplab.ocp.cache import in_turn
@@ -58,7 +59,7 @@ OTHERWISE = "stage 3 began without it instead"  # in words, where stage 2 cannot
 _COUNT = count()
 
 
-class Planner:
+class Planner(Shown):
     """All stages for one robot, built on first use and kept for further targets.
 
     Whatever is changed here holds in every solve of every path: every start, finer meshes,
@@ -120,6 +121,15 @@ class Planner:
             self._settings(kind, False)  # refuses what does not fit
         self._stages: dict[tuple[str, bool], Any] = {}
         self.token = os.getpid(), next(_COUNT)  # the same in copies that other processes get
+
+    def line(self) -> str:
+        """Robot and stages built so far."""
+        return f"{self.robot.name}, built: {', '.join(self.built) or 'nothing yet'}"
+
+    @property
+    def built(self) -> tuple[str, ...]:
+        """Stages that are built, those of flips with the word."""
+        return tuple(name + " of flips" * flip for name, flip in self._stages)
 
     def __getstate__(self) -> dict[str, Any]:
         kept = {k: v for k, v in vars(self).items() if k != "_model"}
@@ -188,9 +198,9 @@ class Planner:
 
     @checked
     @in_turn
-    def terms(self, task: JumpTask = ANY, *, method: str = USUAL) -> list[dict[str, Any]]:
-        """All terms and bounds of the stages for a target, own ones included; ``jl.plots.table``
-        shows them.
+    def terms(self, task: JumpTask = ANY, *, method: str = USUAL) -> Rows:
+        """All terms and bounds of the stages for a target, own ones included; a notebook shows them
+        as a table.
 
         Returns
         -------
@@ -198,9 +208,9 @@ class Planner:
         """
         flip = bool(task.rotation_rad)
         if self.chosen(method) == "direct":
-            return self.program(task).nlp.problem.table()
+            return Rows(self.program(task).nlp.problem.table())
         first, last = (self.stage(name, flip=flip).nlp.problem.table() for name in ("srmp", LAST))
-        return [*first, *self._joint_problem().table(), *last]
+        return Rows([*first, *self._joint_problem().table(), *last])
 
     # what is refused
     # ------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from jumplab.arguments import checked
-from jumplab.errors import InputError
+from jumplab.errors import InputError, Shown
 from jumplab.ocp.nlp import unexplained
 from jumplab.robot import Robot
 from jumplab.stages.planner import Planner, here
@@ -67,7 +67,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Envelope:
+class Envelope(Shown):
     """The map: values of both axes, by default distances (m,) and heights (n,), and all cells, row
     by row.
     """

@@ -61,7 +61,7 @@ def _size(name: str, share: float) -> float:
 
 @dataclass(frozen=True)
 class Margin:
-    """How much of one disturbance, or of several together, a plan bears."""
+    """How much of one disturbance, or of several together, a plan tolerates."""
 
     names: str  # as in :func:`ranges_at`
     reaim: bool  # whether the legs were re-aimed
@@ -73,7 +73,7 @@ class Margin:
 
     @property
     def sizes(self) -> dict[str, float]:
-        """The disturbances there, each in the unit that its name tells."""
+        """The disturbances there, each in the unit of its name."""
         return {name: _size(name, self.share) for name in self.names.split("+")}
 
     @property
@@ -88,7 +88,7 @@ class Margin:
         return {
             "disturbance": self.names,
             "re-aim": self.reaim,
-            "bears": ("≥ " if self.share == 1 else "") + size,
+            "tolerates": ("≥ " if self.share == 1 else "") + size,
             "share of the limit": self.share,
             "land": f"{self.landed} of {self.tried}",
             "interval": f"{low:.0%} ... {high:.0%}",
@@ -112,7 +112,7 @@ class MarginReport(Shown):
         ways = ", one recovery step allowed" * self.step + ", launch corrected" * self.feedback
         return (
             f"{len(self.margins)} margins in {self.engine}{ways}, "
-            f"{whole} of them at the limit of what is tried"
+            f"{whole} of them at the largest size tried"
         )
 
     def to_json(self) -> Plain:

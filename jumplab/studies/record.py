@@ -132,7 +132,7 @@ class Record(Shown):
         landed = [name for name, run in self.runs.items() if run.landed]
         stepped = ""
         if self.value < (1 - SAME) * self.best:
-            stepped = f" (at {self.best:.3f}, from where a clean plan steps back; prices too)"
+            stepped = f" (reduced from {self.best:.3f} until the audit passes; prices: before)"
         played = f", lands at {self.share:.0%} of it in {' and '.join(landed) or 'no engine'}"
         return (
             f"{self.plan.robot.name}: {word} at least {self.value:.3f} {self.unit}{self._at_most} "
@@ -337,7 +337,7 @@ class _Search:
         else:
             raise SolverError(
                 f"robot {robot.name}: {self.what} reaches {getattr(self.task, self.what):.3f} at "
-                f"the nodes, but no plan down to {share:.0%} of it is clean ({failed})"
+                f"the nodes, but no plan down to {share:.0%} of it passes the audit ({failed})"
             )
         if share == 1:
             contacts = body.schedule.contacts

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach
-from jumplab.show.bodies import Silhouette, draw_ground, draw_path, equal_scales, film_strip, strobe
+from jumplab.show.bodies import Silhouette, draw_ground, draw_path, equal_scales, film_strip
 from jumplab.show.jumps import AFTER_TOUCHDOWN_S
 from jumplab.show.style import (
     BAND,
@@ -468,45 +468,35 @@ CUT_M = 0.5  # a CoP further than this from the sole is drawn cut off
 
 
 SNAPSHOT_M = 0.62  # how far the frames of a launch are moved apart
-EDGE_M = 0.05  # a platform begins this far behind the landing heel, as in the planner's limits
 
 
 # Fig. 10 --------------------------------------------------------------------------------------------------------
 @styled
 def snapshots(tape: Tape, robot: Robot) -> Figure:
-    """F-10: the launch with its frames moved apart, then the flight as it is, with the CoM's path; one scale."""
+    """F-10: launch and flight with their frames moved apart, heights to scale, and the CoM's path."""
     fig = new_figure(PAGE_IN, 2.55)
     ax = fig.subplots()
     body, takeoff = Silhouette(robot), tape.takeoff_index
     rows = np.linspace(0, takeoff - 1, FRAMES_LAUNCH).astype(int)
-    places = SNAPSHOT_M * np.arange(FRAMES_LAUNCH)
-    strobe(ax, body, tape.q[rows], [LAUNCH] * FRAMES_LAUNCH, shifts=places)
-    for place, t in zip(places, tape.t[rows], strict=True):
-        ax.text(place, -0.05, f"{t:.2f} s", ha="center", va="top", fontsize=7)
-    first, width = -0.3, SNAPSHOT_M * FRAMES_LAUNCH
-    draw_ground(ax, first, width - 0.25)
-    right = _true_flight(ax, tape, body, width + 0.45)
-    ax.text(first, -0.22, "launch, frames moved apart", ha="left", va="top", color=LAUNCH)
-    ax.text(right, -0.22, "flight, as it is", ha="right", va="top", color=shade(FLIGHT, 0.8))
-    ax.set(xlim=(first - 0.05, right + 0.05))
+    rows = np.append(rows, np.linspace(takeoff, len(tape.t) - 1, FRAMES_FLIGHT).astype(int))
+    places = SNAPSHOT_M * np.arange(len(rows))
+    colors = [PHASE_COLORS[str(tape.phase[row])] for row in rows]
+    film_strip(ax, body, tape.q[rows], tape.t[rows], colors, places)
+    for text, color in zip(ax.texts, colors, strict=True):
+        text.set_color(shade(color, 0.8))
+    air = tape.phase == "flight"
+    draw_path(ax, np.interp(tape.t[air], tape.t[rows], places), tape.extra["com"][air, 2], zorder=4)
+    com = np.interp(tape.t[rows[FRAMES_LAUNCH:]], tape.t, tape.extra["com"][:, 2])
+    marks = dict(linestyle="none", marker="o", markersize=3, color=INK, markerfacecolor="white", zorder=4)
+    ax.plot(places[FRAMES_LAUNCH:], com, **marks)
+    left, right = places[0] - SNAPSHOT_M / 2, places[-1] + 0.8 * SNAPSHOT_M
+    height = float(tape.extra["planar_toe"][-1, 1] - tape.extra["planar_toe"][0, 1])
+    edge = (places[-1] + places[-2]) / 2 if abs(height) > 1e-3 else None
+    draw_ground(ax, left, right, edge=edge, height=height)
+    ax.set(xlim=(left - 0.05, right + 0.05))
+    legend_above(fig, phase_handles("launch", "flight"))
     bare(ax)
     return fig
-
-
-def _true_flight(ax: Axes, tape: Tape, body: Silhouette, shift: float) -> float:
-    """The flight in its true places, moved by ``shift`` [m]; returns the right end of its ground [m]."""
-    rows = np.linspace(tape.takeoff_index, len(tape.t) - 1, FRAMES_FLIGHT).astype(int)
-    strengths = np.linspace(0.55, 1.0, FRAMES_FLIGHT)
-    strobe(ax, body, tape.q[rows], [FLIGHT] * FRAMES_FLIGHT, strengths=strengths, shifts=shift)
-    # planar quantities count from the toe's first place, the tape from the middle of the soles
-    origin = np.array([body.com(tape.q[0])[0] - tape.extra["planar_com"][0, 0] + shift, 0.0])
-    com, toe = tape.extra["planar_com"] + origin, tape.extra["planar_toe"] + origin
-    draw_path(ax, *com[tape.phase == "flight"].T, zorder=4)
-    ax.plot(*com[rows].T, linestyle="none", marker="o", markersize=3, color=INK, markerfacecolor="white", zorder=4)
-    height, heels = float(toe[-1, 1]), toe[[0, -1], 0] + body.robot.sagittal.heel[0]
-    edge = heels[1] - EDGE_M if abs(height) > 1e-3 else None
-    draw_ground(ax, min(heels) - 0.2, max(heels) + 0.45, edge=edge, height=height)
-    return max(heels) + 0.45
 
 
 # contacts -------------------------------------------------------------------------------------------------------

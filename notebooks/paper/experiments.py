@@ -74,6 +74,7 @@ TOLERANCE_M = 0.03  # what a jump of a chain may miss by
 STANDING_UP_S = 1.0  # how much of a landing is shown
 SMOOTHING_S = 0.02  # longer than an impact's ringing, shorter than the landing's push of 0.2 s
 CORRECTION = 0.5  # strength of what is planned on the ground
+PALE = 0.4  # strength of a frame that lies behind others
 BAR = 0.62  # height of a bar of the timeline
 # feature, label, factor to the label's unit
 FEATURES = (
@@ -89,7 +90,7 @@ FEATURES = (
 # A jump in its scene ---------------------------------------------------------------------------------------------
 @styled
 def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure:
-    """A simulated jump where it happened: lift-off, mid-flight, touchdown and the path of the CoM.
+    """A simulated jump where it happened: lift-off, mid-flight (pale), touchdown and the path of the CoM.
 
     The start is moved back and the end forward by :data:`APART_M`; a fall is shown in its
     place.
@@ -108,7 +109,11 @@ def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure
     fig = new_figure(PAGE_IN, min(LEGEND_IN + PAGE_IN * (top - bottom) / (right - left), TALLEST_IN))
     ax = fig.subplots()
     phases = [str(result.phase[row]) for row in rows]
-    strobe(ax, body, frames, [PHASE_COLORS[p] for p in phases], shifts=shifts)
+    order = np.argsort([phase != "flight" for phase in phases], kind="stable")  # the flight behind the others, pale
+    strobe(
+        ax, body, frames[order], [PHASE_COLORS[phases[k]] for k in order], shifts=np.array(shifts)[order],
+        strengths=[PALE if phases[k] == "flight" else 1.0 for k in order],
+    )  # fmt: skip
     for row, shift, phase, frame in zip(rows, shifts, phases, outlines, strict=True):
         trunk = np.vstack([o for part, o in frame if part == "trunk"])
         x, z = trunk[np.argmax(trunk[:, 1])]
@@ -220,23 +225,34 @@ def landing_loads(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
 # Two engines ---------------------------------------------------------------------------------------------------
 @styled
 def engines_compared(runs: Mapping[str, SimulationResult], tape: Tape, robot: Robot) -> Figure:
-    """The same jump by several engines, and the plan: height of the CoM, trunk pitch, force of the ground."""
-    fig = new_figure(PAGE_IN, 2.3)
-    axes = fig.subplots(1, 3)
+    """The same jump by several engines, and the plan: height of the CoM, trunk pitch, force of the ground; below, the
+    deviation of each engine from the plan, before the impact.
+    """
+    fig = new_figure(PAGE_IN, 3.6)
+    axes = fig.subplots(2, 3, sharex="col", height_ratios=(1.4, 1))
     labels = ("height of the CoM [m]", "trunk pitch [deg]", "mean vertical force [kN]")
+    away = ("less the plan [mm]", "less the plan [deg]", "less the plan [kN]")
+    force = smooth(tape.f[:, :, 2].sum(axis=1), float(tape.t[1] - tape.t[0])) / 1000
+    planned = tape.extra["com"][:, 2], np.degrees(trunk_pitch(tape.q)), force
     for (name, run), color, style in zip(runs.items(), (LAUNCH, VERMILION, PURPLE), ("-", "--", "-."), strict=False):
         seen, step = run.t <= tape.t[-1] + STANDING_UP_S, float(run.t[1] - run.t[0])
         force = smooth(run.foot_wrench[:, :, 2].sum(axis=1), step) / 1000
-        for ax, y in zip(axes, (run.com[:, 2], np.degrees(trunk_pitch(run.q)), force), strict=True):
-            ax.plot(run.t[seen], y[seen], style, color=color, label=name)
-    force = smooth(tape.f[:, :, 2].sum(axis=1), float(tape.t[1] - tape.t[0])) / 1000
-    for ax, y in zip(axes, (tape.extra["planar_com"][:, 1], np.degrees(trunk_pitch(tape.q)), force), strict=True):
+        curves = run.com[:, 2], np.degrees(trunk_pitch(run.q)), force
+        with_plan = run.t < tape.t[-1] - SMOOTHING_S  # before the impact
+        for column, y, plan, size in zip(axes.T, curves, planned, (1e3, 1.0, 1.0), strict=True):
+            column[0].plot(run.t[seen], y[seen], style, color=color, label=name)
+            gap = y[with_plan] - np.interp(run.t[with_plan], tape.t, plan)
+            column[1].plot(run.t[with_plan], size * gap, style, color=color)
+    for ax, y in zip(axes[0], planned, strict=True):
         ax.plot(tape.t, y, ":", color=INK, linewidth=1.0, label="plan")
-    limits(axes[2], robot.total_mass * GRAVITY / 1000)
-    for ax, label in zip(axes, labels, strict=True):
-        ax.set(xlabel="time [s]", ylabel=label)
-    panel_letters(axes)
-    legend_above(fig, axes[0].get_legend_handles_labels()[0])
+    limits(axes[0, 2], robot.total_mass * GRAVITY / 1000)
+    for column, label, below in zip(axes.T, labels, away, strict=True):
+        column[0].set_ylabel(label)
+        column[1].set(xlabel="time [s]", ylabel=below)
+        limits(column[1], 0.0)
+    panel_letters(axes[0])
+    fig.align_ylabels()
+    legend_above(fig, axes[0, 0].get_legend_handles_labels()[0])
     return fig
 
 
@@ -301,24 +317,44 @@ def trunk_pitch(q: np.ndarray) -> np.ndarray:
 # Many robots -----------------------------------------------------------------------------------------------------
 @styled
 def trial_map(trials: Sequence[Trial]) -> Figure:
-    """What makes robots fall: each one landed (above) or fallen (below), over six numbers of its draw.
-
-    Bars are success rates of equally many robots each, with Wilson's 95 % interval; one bar if there are few robots.
+    """Robots over six numbers of their draw: landed (above) or fallen (below), with success rates of equally many
+    robots each and Wilson's 95 % interval; where all of them landed, how far they went.
     """
     fig = new_figure(PAGE_IN, 3.3)
     axes = fig.subplots(2, 3, sharey=True)
     landed = np.array([t.landed for t in trials], bool)
+    ends = [getattr(t, "metrics", t) for t in trials] if landed.all() else []  # stored ones are their own metrics
+    travel = [end.foot_distance_m for end in ends if end]
     for ax, (name, label, factor) in zip(axes.flat, FEATURES, strict=True):
         values = factor * np.array([t.features[name] for t in trials])
-        _rates(ax, values, landed)
-        for mask, height, marker, color in ((landed, 1.2, "o", LANDING), (~landed, -0.2, "x", VERMILION)):
-            look = dict(color=color, markersize=3.0, markeredgewidth=0.8, alpha=0.7)
-            ax.plot(values[mask], np.full(mask.sum(), height), marker, **look)
+        if len(travel) == len(trials) > 2:
+            _travels(ax, values, np.array(travel))
+        else:
+            _landings(ax, values, landed)
         ax.margins(x=0.04)
-        ax.set(xlabel=label, ylim=(-0.3, 1.3))
-        ax.set_yticks([-0.2, 0, 0.5, 1, 1.2], ["fell", "0 %", "50 %", "100 %", "landed"])
+        ax.set_xlabel(label)
+    if len(travel):
+        for ax in axes[:, 0]:
+            ax.set_ylabel("travel [m]")
     panel_letters(axes.flat)
     return fig
+
+
+def _travels(ax: Axes, values: np.ndarray, travel: np.ndarray) -> None:
+    """Travel [m] over a number, with the line of least squares and the correlation."""
+    ax.plot(values, travel, "o", color=LANDING, markersize=2.5, alpha=0.6, markeredgewidth=0)
+    ends = np.array([values.min(), values.max()])
+    ax.plot(ends, np.polyval(np.polyfit(values, travel, 1), ends), color=INK, linewidth=1.2)
+    ax.set_title(f"r = {np.corrcoef(values, travel)[0, 1]:.2f}")
+
+
+def _landings(ax: Axes, values: np.ndarray, landed: np.ndarray) -> None:
+    _rates(ax, values, landed)
+    for mask, height, marker, color in ((landed, 1.2, "o", LANDING), (~landed, -0.2, "x", VERMILION)):
+        look = dict(color=color, markersize=3.0, markeredgewidth=0.8, alpha=0.7)
+        ax.plot(values[mask], np.full(mask.sum(), height), marker, **look)
+    ax.set_ylim(-0.3, 1.3)
+    ax.set_yticks([-0.2, 0, 0.5, 1, 1.2], ["fell", "0 %", "50 %", "100 %", "landed"])
 
 
 def _rates(ax: Axes, values: np.ndarray, landed: np.ndarray) -> None:

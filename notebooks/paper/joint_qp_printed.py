@@ -172,7 +172,7 @@ def readings_tried(
             row["torque limits"] = "left out" if off else "yes"
             r = {**tracking(tried[name], srmp, robot), **joint_violations(tried[name], robot)}
             row |= {"take-off speed, off by [%]": 100 * r["takeoff_velocity"]}
-            row |= {"L, off by [%]": 100 * r["launch_momentum"], "force from nowhere [N, N m]": r["base_force"]}
+            row |= {"L, off by [%]": 100 * r["launch_momentum"], "unphysical force [N, N m]": r["base_force"]}
             row |= {"L lost in flight": r["flight_momentum"]}
             break
         rows.append(row)

@@ -22,7 +22,7 @@ from scipy.spatial import ConvexHull
 from jumplab.robot import Robot
 from jumplab.show.bodies import ABOVE_M
 from jumplab.show.jumps import AFTER_TOUCHDOWN_S
-from jumplab.show.shapes import LIMB_SHARE
+from jumplab.show.shapes import LIMB_SHARE, REST_COLOR, rounded_body
 from jumplab.show.style import PAGE_IN, PHASE_COLORS, VERMILION, bare, new_figure, shade, styled, tint
 from jumplab.sim.scene import Scene
 
@@ -30,10 +30,11 @@ if TYPE_CHECKING:
     from jumplab.sim import SimulationResult
 
 OVERSAMPLING = 2  # pictures are drawn larger and averaged, which smooths edges
-JOINT_RADIUS_M, ROD_RADIUS_M = 0.038, 0.018  # balls and rods of the skeleton
+COARSE_M = 0.01  # grid of the corners of a body: finer looks the same, and takes longer
 STRIPE_M = 0.25  # the ground is striped, so that distances can be counted
 SEEN_M, HALF_WIDTH_M = (-4.5, 4.5), 0.45  # what is built of the ground; the longest jump allowed is 3 m
-GREYS, JOINT_GREY = (0.87, 0.76), 0.35
+GREYS = 0.87, 0.76
+BODY = {"trunk": "#4C5A70", "limb": "#BFC7D1", "rest": REST_COLOR}  # a robot outside of any phase
 COLUMNS = 6  # frames per line of a page-wide strip, each then 1.2 in wide
 TITLE_IN = 0.17  # room for a frame's title
 MARK_M = 0.015  # width of a line on the ground
@@ -42,9 +43,6 @@ AMBIENT, DIFFUSE = 0.65, 0.4  # share of its colour that a face has anyway, and 
 DISTANCE_M = 10.0  # far away, so that near and far legs look equally large
 EDGE_ON_M = 1e-9  # the plane of a face goes through the camera
 BELOW_M = 0.14  # seen below the ground
-TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-RING = np.stack([np.cos(TURN), np.sin(TURN), 0 * TURN], -1)  # (24, 3), of a rod
-GLOBE = np.vstack([RING * np.cos(a) + [0, 0, np.sin(a)] for a in np.linspace(-np.pi / 2, np.pi / 2, 13)[1:-1]])
 
 
 @dataclass(frozen=True)
@@ -85,19 +83,19 @@ class Shape:
 
     def __init__(self, joint: int, corners: np.ndarray, color: Sequence[float], part: str = ""):
         self.joint, self.corners, self.color, self.part = joint, corners, np.array(color[:3]), part
-        faces = ConvexHull(corners).equations
+        faces = np.unique(ConvexHull(corners).equations.round(9), axis=0)  # triangles of one plane are one face
         self.normals, self.offsets = faces[:, :3], faces[:, 3]
 
 
 class Renderer:
     """A robot on the ground of a scene (flat if None), with lines across at ``marks`` [m].
 
-    Boxes are drawn as in the URDF, its other shapes as their bounding boxes.
+    Its body is that of :func:`jumplab.show.shapes.rounded_body`.
     """
 
     def __init__(self, robot: Robot, *, scene: Scene | None = None, marks: Sequence[float] = ()):
         self.robot, self._data = robot, robot.model.createData()
-        self._shapes = [*_ground(scene or Scene.flat(), marks), *_links(robot), *_skeleton(robot)]
+        self._shapes = [*_ground(scene or Scene.flat(), marks), *_links(robot)]
 
     def picture(self, q: np.ndarray, camera: Camera, color: str | None = None) -> np.ndarray:
         """The robot at configuration ``q`` (nq,), in its own colours or in ``color``: (height, width, 3), 0 ... 1."""
@@ -176,29 +174,12 @@ def _ground(scene: Scene, marks: Sequence[float]) -> list[Shape]:
 
 
 def _links(robot: Robot) -> list[Shape]:
-    out = []
-    for g in pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.VISUAL).geometryObjects:
-        g.geometry.computeLocalAABB()
-        corners = _box(g.geometry.aabb_local.min_, g.geometry.aabb_local.max_)
-        foot = robot.model.frames[g.parentFrame].name in robot.foot.frames
-        part = "trunk" if g.parentJoint == 1 else "" if foot else "limb"
-        out.append(Shape(g.parentJoint, corners @ g.placement.rotation.T + g.placement.translation, g.meshColor, part))
-    return out
-
-
-def _skeleton(robot: Robot) -> list[Shape]:
-    """A ball at each pitch joint, and a rod from it to the next one above it in its limb, if there is one."""
-    out, grey, model = [], (JOINT_GREY,) * 3, robot.model
-    joints = [model.getJointId(name) for pair in robot.joints.values() for name in pair]
-    for joint in joints:
-        out.append(Shape(joint, JOINT_RADIUS_M * GLOBE, grey))
-        above, way = model.parents[joint], np.array(model.jointPlacements[joint].translation)
-        if above in joints:
-            turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), way).toRotationMatrix()
-            half = float(np.linalg.norm(way)) / 2
-            ends = [ROD_RADIUS_M * RING + [0.0, 0.0, end] for end in (-half, half)]
-            out.append(Shape(above, np.vstack(ends) @ turn.T + way / 2, grey))
-    return out
+    """The robot's body, made coarser; feet and joints keep their colour."""
+    shapes = []
+    for part in rounded_body(robot):
+        corners = COARSE_M * np.unique(np.round(part.points / COARSE_M), axis=0)
+        shapes.append(Shape(part.joint, corners, mcolors.to_rgb(BODY[part.kind]), part.kind.replace("rest", "")))
+    return shapes
 
 
 def frame_rows(result: SimulationResult) -> np.ndarray:

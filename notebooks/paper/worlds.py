@@ -93,9 +93,9 @@ def margins() -> dict[str, dict[str, MarginReport]]:
 
 
 def side_by_side(ways: dict[str, MarginReport]) -> list[dict[str, Any]]:
-    """A line per disturbance: what each way bears of it, plain and re-aimed; empty where it was not tried."""
+    """A line per disturbance: the largest size that each way tolerates; empty where it was not tried."""
     found = {
-        (m.names, f"{way}, {'re-aimed' if m.reaim else 'plain'}"): m.row()["bears"]
+        (m.names, f"{way}, {'re-aimed' if m.reaim else 'plain'}"): m.row()["tolerates"]
         for way, told in ways.items()
         for m in told.margins
     }

@@ -174,8 +174,8 @@ class Contacts:
         if len(first.modes) == 1:
             (side,) = first.modes
             yield (
-                f"phase {first.name!r}: the schedule begins on one foot; where the "
-                f"{SIDES[1 - side]} one waits nobody says; begin with 'LR'"
+                f"phase {first.name!r}: the schedule begins on one foot without a place for "
+                f"the {SIDES[1 - side]} one; begin with 'LR'"
             )
         before = [{}, *(p.modes for p in phases)]
         pairs = enumerate(zip(before, phases, strict=False))
