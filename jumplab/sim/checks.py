@@ -262,7 +262,7 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[float, float]:
     least = 0.0
     if not (hard and ground.plain):
         corners = before[:, None, :3, 3] + robot.foot.corners @ before[:, :3, :3].swapaxes(1, 2)
-        sunk = np.array([sunk[0], [ground.depth_of(points, soft=hard) for points in corners]])
+        sunk = np.array([sunk[0], ground.depth_of(corners, soft=hard)])
         # usual contacts act in the middle of the depth, beyond the tip of a tilted sole
         least = 0.0 if hard else sunk[1] / 2
     beyond = [

@@ -68,6 +68,10 @@ class Block:
 
     def height_at(self, x: float, y: float = 0.0) -> float:
         """Height of the plane of its top at ``x``, and ``y`` to the left of the jump [m]."""
+        return self._height(x, y)
+
+    def _height(self, x, y):
+        """The same of arrays of places, unchecked."""
         a, b, c = self.turn[:, 2]
         return self.top - (a * (x - self.pivot_m) + b * y) / c
 
@@ -199,16 +203,20 @@ class Scene:
         """(3,) upward, across the top below a ``point`` (3,) of the world."""
         return about_vertical(self.along_rad) @ self.below(point)[0].turn[:, 2]
 
-    def depth_of(self, points: np.ndarray, soft: bool = True) -> float:
-        """How deep the lowest of some ``points`` (k, 3) of the world lies in the ground, in
-        ``soft`` ground alone if wanted [m].
+    def depth_of(self, points: np.ndarray, soft: bool = True) -> np.ndarray:
+        """How deep the lowest of each row of ``points`` (..., k, 3) of the world lies in the ground
+        (...,), in ``soft`` ground alone if wanted [m].
         """
-        depths = [0.0]
-        for point in points:
-            block, top = self.below(point)
-            if block.soft_m or not soft:
-                depths.append(top - float(point[2]))
-        return max(depths)
+        x, y, z = np.moveaxis(points @ about_vertical(self.along_rad), -1, 0)
+        top = np.full(x.shape, NOTHING.top)
+        deep = np.zeros(x.shape)
+        for b in self.blocks:
+            height = b._height(x, y)
+            here = (b.x_from <= x) & (x <= b.x_to) & (b.y_from <= y) & (y <= b.y_to)
+            here &= height > top
+            top[here] = height[here]
+            deep[here] = (height - z)[here] if b.soft_m or not soft else 0.0
+        return deep.max(axis=-1, initial=0.0)
 
     def along(self, point: np.ndarray) -> tuple[float, float]:
         """Place of a ``point`` (3,) along the heading of the landing, and to its left [m]."""
