@@ -102,7 +102,7 @@ class LaunchFeedback:
         self._stand: Stand | None = None
         # pitch momentum that was missing so far, summed over time [kg m^2]
         self._unturned = 0.0
-        self._speed = 0.0  # of the feet along the jump, filtered [m/s]
+        self._speed = np.zeros(3)  # of the feet that carry, filtered [m/s]
         air_s = [np.ptp(tape.t[rows]) for rows in tape.flights]
         self._fade_rate = max([FADE_RATE, *(FADED / (FADE_SHARE * x) for x in air_s)])
         self._air_s = next(iter(air_s), np.inf)  # of the first flight
@@ -283,18 +283,18 @@ class LaunchFeedback:
         return np.clip(change, -MOST, MOST), tau
 
     def _creep(self, stand: Stand, carries: np.ndarray) -> np.ndarray:
-        """Rate (6,) of the twist with which feet that carry move along the jump; none is felt yet
-        where the ``stand`` is new.
+        """Rate (6,) of the twist with which feet that carry move along the jump and up; none is
+        felt yet where the ``stand`` is new.
 
         Their other motions are left out: answered to, they would swing.
         """
-        speed = float(self._body.twists[carries, :3].mean(axis=0) @ self._forward)
+        speed = self._body.twists[carries, :3].mean(axis=0)
         if stand != self._stand:
             self._stand = stand
             self._speed = speed
         gained = (speed - self._speed) / CREEP_S
-        self._speed += PERIOD_STEPS * STEP_S * gained
-        return np.append(gained * self._forward, np.zeros(3))
+        self._speed = self._speed + PERIOD_STEPS * STEP_S * gained
+        return np.append(gained - self._left @ gained * self._left, np.zeros(3))
 
     def _back(self, rate: float) -> np.ndarray:
         """Accelerations (nv - 6,) that lead the joints back to the tape, critically damped."""
