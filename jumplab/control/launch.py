@@ -4,9 +4,13 @@ A tape that is followed joint by joint moves a robot unlike its plan, or one tha
 in, with another momentum and over another place: its feet tip, and on its toes it falls on like a
 pendulum. Here, every 2 ms, joint accelerations and foot wrenches are chosen that obey the base
 dynamics, friction, the soles' edges and the motors' torques, and come closest to the planned CoM,
-its velocity, the angular momentum and the planned joints, with the feet still. What the joints'
-accelerations differ by from the tape's is integrated and added to it, and so are the torques that
-go with them.
+its velocity, the angular momentum and the planned joints, with the feet moving on as they do. What
+the joints' accelerations differ by from the tape's is integrated and added to it, and so are the
+torques that go with them.
+
+Feet that creep, as on contacts that give way, take the planned place of the CoM along, or the
+forces on them would turn the body. Its planned velocity is that in the world, and what the feet
+have lost of their way until take-off is made good by speed.
 
 Feet that stand flat tell where the CoM really is: a load that the trunk carries besides pushes them
 by its mass times the acceleration of the trunk, and turns them by that push about where it is. Its
@@ -51,6 +55,8 @@ DIGITS = 9  # of accelerations: ProxQP's last ones depend on where its memory li
 # natural frequencies [rad/s] of critically damped wishes
 COM_RATE = 8.0  # twice the pendulum's own: the launch is over within a second
 MOMENTUM_RATE = 10.0
+PITCH_RATE = 20.0  # of that about the pitch axis over time: its lack turns the body in flight
+CREEP_S = 0.01  # [s] in which the rate of the feet's speed is taken; 20 ms are too late
 POSTURE_RATE = 4.0  # back to the tape, where nothing else is asked
 # back to the tape in the air, or faster in a short flight: before legs are re-aimed
 FADE_RATE = 20.0
@@ -93,17 +99,23 @@ class LaunchFeedback:
         self._gauge = Gauge(robot)
         self.solver = solver()
         self.off_m = 0.0
+        self._stand: Stand | None = None
+        # pitch momentum that was missing so far, summed over time [kg m^2]
+        self._unturned = 0.0
+        self._speed = np.zeros(3)  # of the feet that carry, filtered [m/s]
         air_s = [np.ptp(tape.t[rows]) for rows in tape.flights]
         size = self._body.size
         self._rolling = round(size.of(ROLLING_S, "s") / STEP_S)
         self._most_off_m = size.of(MOST_OFF_M, "m")
-        self._com_rate, self._momentum_rate, self._posture_rate, fade_rate = (
-            size.of(x, "rad/s") for x in (COM_RATE, MOMENTUM_RATE, POSTURE_RATE, FADE_RATE)
+        rates = COM_RATE, MOMENTUM_RATE, PITCH_RATE, POSTURE_RATE, FADE_RATE
+        self._com_rate, self._momentum_rate, self._pitch_rate, self._posture_rate, fade_rate = (
+            size.of(x, "rad/s") for x in rates
         )
         self._turning = size.of(1.0, "s") ** 4  # on weights of angular accelerations
         self._most = size.of(MOST, "rad/s^2")
         self._reading = np.array([READING[0], size.of(READING[1], "m")])
         self._fade_rate = max([fade_rate, *(FADED / (FADE_SHARE * x) for x in air_s)])
+        self._air_s = next(iter(air_s), np.inf)  # of the first flight
         # of the joints, off the tape
         self.angles, self._rates, self.changes = np.zeros((3, len(robot.joint_names)))
         self._none = np.zeros(len(robot.joint_names))
@@ -240,25 +252,36 @@ class LaunchFeedback:
         body.update(q, v, anchors)
         body.set_contact(carries)
         com, speed, push, momentum, spin, _, *toes = self.rows[due]
-        if due >= self.playback.lands:  # the plan goes on where the feet came down
-            com = com + [1.0, 1.0, 0.0] * np.subtract(self._toes(q), toes)[carries].mean(axis=0)
+        # the plan goes on where the feet are, and ends where it would have
+        moved = [1.0, 1.0, 0.0] * np.subtract(self._toes(q), toes)[carries].mean(axis=0)
+        com = com + moved
+        if due < self.playback.lands:
+            speed = speed - moved / self._air_s
         ahead = self.off_m * self._forward
         # that the real CoM takes besides
         moment = np.cross(ahead, body.mass * (push - body.gravity))
         shift = self._com_rate**2 * (com - ahead - body.com)
         shift = shift + 2 * self._com_rate * (speed - body.com_velocity)
-        turn = spin + moment + self._momentum_rate * (momentum - body.momentum)
+        missing = momentum - body.momentum
+        pitching = float(self._left @ missing)
+        self._unturned += PERIOD_STEPS * STEP_S * pitching
+        pitch_rate = self._pitch_rate
+        faster = 2 * pitch_rate * pitching + pitch_rate**2 * self._unturned
+        turn = spin + moment + self._momentum_rate * (missing - pitching * self._left)
+        turn = turn + faster * self._left
         tape = self.playback.acceleration(due)
         back = self._back(self._posture_rate)
         qp = body.program(v, np.vstack(corners), moment)
         body.balance(qp, push + shift, turn, (COM_WEIGHT, self._turning * MOMENTUM_WEIGHT))
         posture = np.full(len(back), self._turning * POSTURE_WEIGHT)
+        creep = self._creep(stand, carries)
         for side, x in enumerate(stand):
             if x == tapes.AIR:
                 posture[self._legs[side]] = self._turning * SWING_WEIGHT
                 continue
             still = FOOT_WEIGHT * np.array([1.0, 1.0, 1.0, 1.0, float(x == tapes.FLAT), 1.0])
-            qp.cost(f"foot {side}", body.sole_rows[side], -body.sole_drift[side], still)
+            moves = creep - body.sole_drift[side]
+            qp.cost(f"foot {side}", body.sole_rows[side], moves, still)
         qp.cost("posture", body.unknowns[6 : body.nv], tape + back, posture)
         qp.cost("base", body.unknowns[:6], 0.0, LEAST)
         qp.cost("wrenches", body.unknowns[body.nv :], 0.0, LEAST_WRENCH)
@@ -270,6 +293,20 @@ class LaunchFeedback:
         change = np.round(answer.x[6 : body.nv], DIGITS) - tape
         tau = np.round(body.torque(answer.x), TORQUE_DIGITS) + body.motors.lost(v[6:])
         return np.clip(change, -self._most, self._most), tau
+
+    def _creep(self, stand: Stand, carries: np.ndarray) -> np.ndarray:
+        """Rate (6,) of the twist with which feet that carry move along the jump and up; none is
+        felt yet where the ``stand`` is new.
+
+        Their other motions are left out: answered to, they would swing.
+        """
+        speed = self._body.twists[carries, :3].mean(axis=0)
+        if stand != self._stand:
+            self._stand = stand
+            self._speed = speed
+        gained = (speed - self._speed) / CREEP_S
+        self._speed = self._speed + PERIOD_STEPS * STEP_S * gained
+        return np.append(gained - self._left @ gained * self._left, np.zeros(3))
 
     def _back(self, rate: float) -> np.ndarray:
         """Accelerations (nv - 6,) that lead the joints back to the tape, critically damped."""

@@ -1,18 +1,28 @@
-"""Harder worlds: how many perturbed robots land in each, with the legs re-aimed in the air and without."""
+"""Harder worlds: how many perturbed robots land in each, with the legs re-aimed in the air and without; and drawn plans
+on the contacts, friction and motors that nobody planned for.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections import Counter
 from collections.abc import Iterable
-from itertools import product
+from itertools import chain, product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import joblib
+import numpy as np
+
+import jumplab as jl
+from jumplab.control.kinematics import rotation
+from jumplab.errors import SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim import ENGINES, Perturbation, Ranges, Scene, SimulationResult, simulate_jump
+from jumplab.sim import ENGINES, STEP_S, Perturbation, Ranges, Scene, SimulationResult, simulate_jump
 from jumplab.studies.margins import MarginReport, ranges_at
+from jumplab.studies.study import in_parallel
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 from paper import logs
 
@@ -33,6 +43,27 @@ WORLDS = {
 }
 # robots that jump re-aimed there; the first ROBOTS of them also plain
 MANY = {"twice the usual ranges": 250, "shove of 15 N s in flight": 100}
+
+DRAWN = Path(__file__).with_name("drawn.jsonl")
+# per robot: plans, and from how far to how far, how high, how far aside [m] and turned [rad] they go, onto what [m]
+HUMANOIDS = {
+    "bhr": (36, (0.2, 1.1), (0.25, 0.5), 0.3, 0.8, (-0.15, 0.2)),
+    "g1_arms": (20, (0.1, 0.5), (0.12, 0.25), 0.12, 0.5, (-0.1, 0.1)),
+    "g1": (4, (0.1, 0.4), (0.12, 0.2), 0.0, 0.0, (-0.1, 0.1)),
+}
+KINDS = "flat", "platform", "side", "turn", "gravity"
+MOTORS = dict(rotor_kg_m2=(0.02, 0.02), damping_n_m_s=(1.0, 1.0))
+USUAL = dict(engine="mujoco", contact="usual")
+# world -> engine and contact, and how the robot differs
+PLAYED = {
+    "MuJoCo, usual": (USUAL, {}),
+    "MuJoCo, hard": (dict(engine="mujoco"), {}),
+    "MuJoCo, usual, friction 0.4": (USUAL, dict(friction=(0.4, 0.4))),
+    "MuJoCo, usual, unknown rotors and damping": (USUAL, MOTORS),
+    "PyBullet, hard": (dict(engine="bullet"), {}),
+    "PyBullet, usual": (dict(engine="bullet", contact="usual"), {}),
+}
+WAYS = {"open loop": {}, "feedback": dict(feedback=True)}
 
 # what a fall of the default jump begins with: the robot's seed, and the disturbances that it meets at their limits
 FALLS = {
@@ -79,6 +110,95 @@ def flips(folder: str | Path, path: Path = FLIPS, *, jobs: int | None = None) ->
             row = {"engine": engine, "number": trial.key.index, "landed": trial.landed}
             rows.append(row | ({} if trial.landed else {"cause": trial.cause}))
     logs.write(path, rows, folder=folder)
+
+
+def drawn(seed: int = 41) -> dict[str, tuple[str, jl.JumpTask]]:
+    """Targets by name, with their robot: of each kind as many, the same ones whenever they are drawn."""
+    rng = np.random.default_rng(seed)
+    cases = {}
+    for robot, (count, far, high, side_m, yaw_rad, tops_m) in HUMANOIDS.items():
+        for k in range(count):
+            kind = KINDS[k % len(KINDS) if side_m else (0, 1, 4)[k % 3]]
+            place = [rng.uniform(*x) for x in (far, high)]
+            asked = dict(zip(("distance_m", "height_m"), place, strict=True))
+            side, yaw = rng.uniform(-1, 1, 2) * [side_m, yaw_rad]
+            top, gravity = rng.uniform(*tops_m), rng.uniform(6.0, 11.0)
+            if kind in ("side", "turn"):
+                asked |= {"distance_m": place[0] / 2, "side_m": side} | ({"yaw_rad": yaw} if kind == "turn" else {})
+            if kind == "platform":
+                asked |= {"distance_m": max(place[0], 0.3), "platform_m": top, "height_m": place[1] + max(top, 0.0)}
+            if kind == "gravity":
+                asked |= {"gravity": gravity}
+            cases[f"{robot} {k} {kind}"] = robot, jl.JumpTask(**{name: round(x, 2) for name, x in asked.items()})
+    return cases
+
+
+def contacts(folder: str | Path, path: Path = DRAWN, *, jobs: int | None = None) -> None:
+    """Play the :func:`drawn` plans in every world of :data:`PLAYED` and each way; a row each, written at once.
+
+    What the log has is not done again; plans are kept in ``folder``. ``python -m paper.worlds --contacts DIR [JOBS]``
+    calls it.
+    """
+    cases = drawn()
+    with logs.keep(path, itemgetter("case", "world", "way")) as log:
+        left = {key: [way for way in WAYS if (*key, way) not in log.done] for key in product(PLAYED, cases)}
+        work = [joblib.delayed(_play)(Path(folder), *key, *cases[key[1]], ways) for key, ways in left.items() if ways]
+        for row in chain.from_iterable(in_parallel(work, jobs, "generator")):
+            log.add(row)
+
+
+def _play(folder: Path, world: str, case: str, robot: str, task: jl.JumpTask, ways: list[str]) -> list[dict[str, Any]]:
+    """Playbacks of one plan, see :func:`_played`; or why there is no plan."""
+    place = folder / case
+    rows = [{"world": world, "case": case, "way": way} for way in ways]
+    try:
+        if not (place / "plan.npz").is_file():
+            jl.save(place, jl.plan(task, robot))
+        plan = jl.load(place).plan
+    except SolverError as e:
+        return [row | {"refusal": str(e)} for row in rows]
+    return [row | _played(plan, world, row["way"]) for row in rows]
+
+
+def _played(plan: jl.JumpPlan, world: str, way: str) -> dict[str, Any]:
+    """Whether it stands, and by how much the place of the feet, the CoM's apex and rise, and the trunk's tilt at
+    touchdown differ from the plan's.
+    """
+    options, ranges = PLAYED[world]
+    differs = Perturbation.draw(plan.robot, SEED, Ranges.none(**ranges)) if ranges else None
+    run = jl.simulate(plan, perturbation=differs, **options, **WAYS[way])
+    m, tape = run.metrics, plan.tape
+    row = {"stands": run.landed, "reason": run.reason}
+    row["failed_checks"] = [check.name for check in run.checks if not check.passed]
+    if None not in (m.foot_distance_m, m.com_rise_m, m.touchdown_s):
+        off = m.foot_distance_m - plan.planned_distance_m, m.side_m - plan.planned_side_m
+        row |= {"short_m": -off[0], "miss_m": float(np.hypot(*off))}
+        row |= {"apex_m": m.com_apex_m - plan.planned_apex_m, "rise_m": m.com_rise_m - plan.planned_rise_m}
+        ends = run.q[round(m.touchdown_s / STEP_S)], tape.q[tape.flights[-1].stop - 1]
+        turned = np.subtract(*(rotation(q[3:7])[2] for q in ends))  # of the vertical, in the trunk's axes
+        row["tilt_deg"] = float(np.degrees(2 * np.arcsin(min(1.0, np.linalg.norm(turned) / 2))))
+    return {key: round(x, 5) if isinstance(x, float) else x for key, x in row.items()}
+
+
+def outcomes(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line per world and way: how many drawn plans stand, with Wilson's 95 % interval, and what half and 95 % of
+    those that stand stay below.
+    """
+    lines = []
+    for world, way in product(PLAYED, WAYS):
+        here = [r for r in rows if (r["world"], r["way"]) == (world, way) and "stands" in r]
+        if not here:
+            continue
+        stand = [r for r in here if r["stands"]]
+        low, high = wilson(len(stand), len(here))
+        line = {"world": world, "way": way, "plans": len(here), "stand": len(stand)}
+        line |= {"from [%]": 100 * low, "to [%]": 100 * high}
+        for name, key, unit in (("miss", "miss_m", "cm"), ("apex", "apex_m", "cm"), ("tilt", "tilt_deg", "deg")):
+            size = np.abs([r[key] for r in stand]) * (100 if unit == "cm" else 1)
+            half, most = np.quantile(size, [0.5, 0.95]) if len(size) else (None, None)
+            line |= {f"{name}, half [{unit}]": half, f"{name}, 95 % [{unit}]": most}
+        lines.append(line)
+    return lines
 
 
 def stored(path: Path = LOG) -> list[dict[str, Any]]:
@@ -148,5 +268,6 @@ def share(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    made, rest = (flips, sys.argv[2:]) if sys.argv[1] == "--flips" else (study, sys.argv[1:])
+    made = {"--flips": flips, "--contacts": contacts}.get(sys.argv[1], study)
+    rest = sys.argv[1 + (made is not study) :]
     made(rest[0], jobs=int(rest[1]) if len(rest) > 1 else None)
