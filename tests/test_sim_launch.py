@@ -76,7 +76,7 @@ def test_a_wrong_posture_moves_what_is_followed(bhr, tape):
 
 
 # drives lag a little, 1.5 mm of the CoM that feet feel
-@pytest.mark.parametrize("mode, farthest_rad, off_m", [(MODE, 0.008, 0.002), (BASE, 0.008, 0.001)])
+@pytest.mark.parametrize("mode, farthest_rad, off_m", [(MODE, 0.006, 0.002), (BASE, 0.005, 0.001)])
 def test_the_planned_robot_launches_as_planned(bhr, tape, mode, farthest_rad, off_m):
     plain, led = (simulate_jump(tape, bhr, mode=mode, feedback=on, stand_s=0.5) for on in (False, True))
     said = led.settings["feedback"]

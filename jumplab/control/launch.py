@@ -55,7 +55,9 @@ DIGITS = 9  # of accelerations: ProxQP's last ones depend on where its memory li
 # natural frequencies [rad/s] of critically damped wishes
 COM_RATE = 8.0  # twice the pendulum's own: the launch is over within a second
 MOMENTUM_RATE = 10.0
-PITCH_RATE = 20.0  # of that about the pitch axis over time: its lack turns the body in flight
+# of that about the pitch axis over time, once heels rise: its lack turns the body in flight;
+# sooner, loads and shoves would tip the robot
+PITCH_RATE = 20.0
 CREEP_S = 0.01  # [s] in which the rate of the feet's speed is taken; 20 ms are too late
 POSTURE_RATE = 4.0  # back to the tape, where nothing else is asked
 # back to the tape in the air, or faster in a short flight: before legs are re-aimed
@@ -100,7 +102,7 @@ class LaunchFeedback:
         self.solver = solver()
         self.off_m = 0.0
         self._stand: Stand | None = None
-        # pitch momentum that was missing so far, summed over time [kg m^2]
+        # pitch momentum that was missing since the heels rose, summed over time [kg m^2]
         self._unturned = 0.0
         self._speed = np.zeros(3)  # of the feet that carry, filtered [m/s]
         air_s = [np.ptp(tape.t[rows]) for rows in tape.flights]
@@ -263,18 +265,20 @@ class LaunchFeedback:
         shift = self._com_rate**2 * (com - ahead - body.com)
         shift = shift + 2 * self._com_rate * (speed - body.com_velocity)
         missing = momentum - body.momentum
-        pitching = float(self._left @ missing)
-        self._unturned += PERIOD_STEPS * STEP_S * pitching
-        pitch_rate = self._pitch_rate
-        faster = 2 * pitch_rate * pitching + pitch_rate**2 * self._unturned
-        turn = spin + moment + self._momentum_rate * (missing - pitching * self._left)
-        turn = turn + faster * self._left
+        turn = spin + moment + self._momentum_rate * missing
+        rolls = tapes.TOE in stand
+        if rolls:
+            pitching = float(self._left @ missing)
+            self._unturned += PERIOD_STEPS * STEP_S * pitching
+            pitch_rate = self._pitch_rate
+            faster = (2 * pitch_rate - self._momentum_rate) * pitching
+            turn = turn + (faster + pitch_rate**2 * self._unturned) * self._left
         tape = self.playback.acceleration(due)
         back = self._back(self._posture_rate)
         qp = body.program(v, np.vstack(corners), moment)
         body.balance(qp, push + shift, turn, (COM_WEIGHT, self._turning * MOMENTUM_WEIGHT))
         posture = np.full(len(back), self._turning * POSTURE_WEIGHT)
-        creep = self._creep(stand, carries)
+        creep = self._creep(stand, carries) if rolls else np.zeros(6)
         for side, x in enumerate(stand):
             if x == tapes.AIR:
                 posture[self._legs[side]] = self._turning * SWING_WEIGHT
