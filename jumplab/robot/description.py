@@ -289,11 +289,6 @@ class Robot(Shown):
             joints or roles.
         joints : joint or role -> new values of ``lower``, ``upper`` [rad], ``effort`` [N m] or
             ``speed`` [rad/s], some or all; the range of a role in the signs of :attr:`sagittal`.
-
-        Roles are those of :attr:`joints`, or hip, knee, ankle, shoulder; where a joint and its role
-        are both named, the joint's own counts. The URDF gets the new numbers, the TOML a remark on
-        each, so the :attr:`hash` is new. Raises :class:`RobotError` for names that the robot lacks,
-        for numbers that are no limits, and if the robot cannot stand within them.
         """
         factors = {"effort": effort, "speed": speed}
         return self._changed(*changes.limits(self, factors, joints))

@@ -57,7 +57,7 @@ class Size:
     mass: float
 
     def of(self, value: float | np.ndarray, unit: str) -> Any:
-        """A ``value`` that was found for the one robot, in one of :data:`UNITS`, for this one."""
+        """A ``value`` [``unit``, one of :data:`UNITS`] that was found for the one robot, for this one."""
         kg, m, s = UNITS[unit]
         return value * (self.mass**kg * self.length ** (m + s / 2))
 

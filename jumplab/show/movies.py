@@ -100,6 +100,9 @@ def movie(
     """A planned or simulated jump at half its speed, until it stands; launch, flight and landing in
     their colours, lines across the ground every 0.5 m and where the toes start and land.
 
+    Raises :class:`InputError` for another kind, a robot without a record, or where nothing can
+    draw.
+
     Parameters
     ----------
     of : a plan or a simulation, shown on its own ground; or a robot, whose ``record`` (a tape or a
@@ -107,9 +110,6 @@ def movie(
     scene : another ground; flat if a robot is given and this is None.
     kind : "gif" or "mp4" (20 or 30 frames a second).
     forces : draw the forces of the ground, an arrow for each foot; 0.6 m are the robot's weight.
-
-    Raises :class:`InputError` for another kind, a robot without a record, or where nothing can
-    draw.
     """
     if kind not in KINDS:
         raise InputError(f"a movie must be one of {', '.join(KINDS)}, got {kind!r}")

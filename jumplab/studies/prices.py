@@ -185,7 +185,7 @@ class Pricer:
 
 
 def priced(record: Record, most: int) -> Prices:
-    """The prices of a record."""
+    """The prices of a record [m or rad of it per unit of each limit]."""
     program = record.program
     task = record.plan.task
     pricer = Pricer(program, task, record.solved)
