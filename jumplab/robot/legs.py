@@ -57,7 +57,9 @@ class Size:
     mass: float
 
     def of(self, value: float | np.ndarray, unit: str) -> Any:
-        """A ``value`` [``unit``, one of :data:`UNITS`] that was found for the one robot, for this one."""
+        """A ``value`` [``unit``, one of :data:`UNITS`] that was found for the one robot, as it is
+        for this one.
+        """
         kg, m, s = UNITS[unit]
         return value * (self.mass**kg * self.length ** (m + s / 2))
 
