@@ -140,14 +140,13 @@ def test_a_refusal_names_the_record_that_is_near(bhr, monkeypatch):
 @published
 @pytest.mark.slow  # two plans on finer meshes
 def test_the_cheapest_of_several_starts_counts_and_the_others_say_how_they_differ():
-    task = jl.JumpTask(0.5, 0.3)
-    plan = jl.plan(task, "g1", starts=2)
+    plan = jl.plan(jl.JumpTask(0.3, 0.2), "bhr", starts=7)
     told = [x for x in plan.attempts if x.cost is not None]
-    assert [x.start for x in told] == ["schedule, finer mesh", "stance, finer mesh"]
-    first, second = told
-    assert plan.whole_body.solution.statistics.objective == min(first.cost, second.cost)
-    assert min(first.cost, second.cost) < 0.8 * max(first.cost, second.cost)
-    assert abs(first.heels_rad - second.heels_rad) > 0.2 and min(first.crouch_m, second.crouch_m) > 0.1
+    assert [x.start for x in told][:2] == ["schedule", "stance"] and len(told) == 7
+    costs = [x.cost for x in told]
+    assert plan.whole_body.solution.statistics.objective == min(costs) < 0.85 * max(costs)
+    first, dear = told[0], told[int(np.argmax(costs))]
+    assert abs(first.heels_rad - dear.heels_rad) > 0.03 and min(first.crouch_m, dear.crouch_m) > 0.1
     assert jl.audit(plan).passed
 
 

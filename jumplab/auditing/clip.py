@@ -143,7 +143,8 @@ def _judged(clip: Clip) -> ClipReport:
         ],
         "versions": versions(),
     }
-    report = ClipReport(checks, manifest, clip, tape, ground, still, _series(r))
+    found = {"clip": clip, "tape": tape, "ground": ground, "still": still}
+    report = ClipReport(checks, manifest, **found, series=_series(r))
     manifest["phases"] = [list(phase) for phase in report.phases]
     return report
 

@@ -83,7 +83,8 @@ def size(robot: Robot) -> Size:
     joints = [robot.model.getJointId(robot.joints[role][0]) for role in roles]
     places = np.array([data.oMi[joint].translation[[0, 2]] for joint in joints])
     leg_m = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
-    return Size(float(leg_m) / LEG_M, robot.total_mass / MASS_KG)
+    # without the last digits, so that the one robot has the numbers as they stand
+    return Size(*(round(float(x), 9) for x in (leg_m / LEG_M, robot.total_mass / MASS_KG)))
 
 
 def leg_columns(robot: Robot) -> list[np.ndarray]:
