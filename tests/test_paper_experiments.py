@@ -218,6 +218,18 @@ def test_harder_worlds_are_told_where_the_same_robots_jumped_both_ways():
                     "falls of the re-aimed": "tip 1"}  # fmt: skip
 
 
+def test_drawn_plans_are_the_same_ones_and_their_outcomes_are_told_by_world_and_way():
+    cases = worlds.drawn()
+    assert cases == worlds.drawn() != worlds.drawn(1) and sum(robot != "bhr" for robot, _ in cases.values()) >= 20
+    rows = [{"world": "MuJoCo, usual", "way": "feedback", "stands": x < 3, "miss_m": x / 100, "apex_m": -0.01,
+             "tilt_deg": 2.0} for x in range(4)]  # fmt: skip
+    (line,) = worlds.outcomes([*rows, {"world": "MuJoCo, usual", "way": "open loop", "refusal": "no plan"}])
+    assert (line["plans"], line["stand"], line["miss, half [cm]"]) == (4, 3, pytest.approx(1.0))
+    assert line["from [%]"] == pytest.approx(100 * wilson(3, 4)[0]) and line["apex, 95 % [cm]"] == pytest.approx(1.0)
+    stored = worlds.stored(worlds.DRAWN)
+    assert {r["case"] for r in stored} <= cases.keys() and {r["world"] for r in stored} <= worlds.PLAYED.keys()
+
+
 def test_rows_of_harder_worlds_are_of_known_worlds():
     rows = worlds.stored()
     assert {r["world"] for r in rows} == set(worlds.WORLDS) and worlds.shares(rows)

@@ -140,7 +140,7 @@ def contacts(folder: str | Path, path: Path = DRAWN, *, jobs: int | None = None)
     calls it.
     """
     cases = drawn()
-    with logs.keep(path, itemgetter("case", "world", "way")) as log:
+    with logs.keep(path, itemgetter("world", "case", "way")) as log:
         left = {key: [way for way in WAYS if (*key, way) not in log.done] for key in product(PLAYED, cases)}
         work = [joblib.delayed(_play)(Path(folder), *key, *cases[key[1]], ways) for key, ways in left.items() if ways]
         for row in chain.from_iterable(in_parallel(work, jobs, "generator")):
@@ -195,7 +195,7 @@ def outcomes(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         line |= {"from [%]": 100 * low, "to [%]": 100 * high}
         for name, key, unit in (("miss", "miss_m", "cm"), ("apex", "apex_m", "cm"), ("tilt", "tilt_deg", "deg")):
             size = np.abs([r[key] for r in stand]) * (100 if unit == "cm" else 1)
-            half, most = np.quantile(size, [0.5, 0.95]) if len(size) else (None, None)
+            half, most = np.quantile(size, [0.5, 0.95]).tolist() if len(size) else (None, None)
             line |= {f"{name}, half [{unit}]": half, f"{name}, 95 % [{unit}]": most}
         lines.append(line)
     return lines
