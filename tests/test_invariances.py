@@ -31,7 +31,9 @@ from jumplab.io.folder import read_json, to_json
 from jumplab.io.motion import Motion
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.robot.legs import Size, size
 from jumplab.robot.stance import stance_angles, stance_configuration
+from jumplab.stages.whole_body.settings import LIMIT_UNITS, WEIGHT_UNITS, Limits, Weights
 from jumplab.task import JumpTask
 
 ROBOT = Robot.load()
@@ -109,6 +111,15 @@ def test_a_robot_of_another_size(size):
         np.testing.assert_allclose(getattr(other.sagittal, name), expected, rtol=1e-8, atol=1e-12, err_msg=name)
     np.testing.assert_allclose(stance_angles(other), stance_angles(one), atol=1e-8)
     assert other.foot.toe == pytest.approx(size * one.foot.toe) and other.total_mass == pytest.approx(42.0 * size**3)
+
+
+def test_every_length_time_and_weight_is_of_a_size():
+    """But for edges of platforms, which are the world's, flights, which depend on gravity, and shares."""
+    lengths = {name for name in vars(Limits()) if name.endswith(("_m", "_s"))}
+    assert {name for name in lengths if name not in LIMIT_UNITS} == {
+        "edge_clearance_m", "edge_smoothing_m", "edge_before_heel_m", "edge_step_m", "flight_s"}  # fmt: skip
+    assert set(vars(Weights())) - set(WEIGHT_UNITS) == {"follow_duration"}
+    assert size(ROBOT) == Size(1.0, 1.0) and Limits().of_size(size(ROBOT)) == Limits()
 
 
 @pytest.mark.slow

@@ -77,14 +77,20 @@ class Size:
 
 def size(robot: Robot) -> Size:
     """The size of a ``robot``, by its mass, and by thigh and shank between the pitch axes."""
+    ratios = sum(segments_m(robot)) / LEG_M, robot.total_mass / MASS_KG
+    # without the last digits, so that the one robot has the numbers as they stand
+    return Size(*(round(x, 9) for x in ratios))
+
+
+def segments_m(robot: Robot) -> tuple[float, float]:
+    """Lengths of thigh and shank of the left leg, between its pitch axes [m]."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, pin.neutral(robot.model))
     roles = "hip_pitch", "knee", "ankle_pitch"
     joints = [robot.model.getJointId(robot.joints[role][0]) for role in roles]
     places = np.array([data.oMi[joint].translation[[0, 2]] for joint in joints])
-    leg_m = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
-    # without the last digits, so that the one robot has the numbers as they stand
-    return Size(*(round(float(x), 9) for x in (leg_m / LEG_M, robot.total_mass / MASS_KG)))
+    thigh, shank = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    return float(thigh), float(shank)
 
 
 def leg_columns(robot: Robot) -> list[np.ndarray]:

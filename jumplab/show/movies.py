@@ -53,7 +53,7 @@ FIXED_M = 2.0  # jumps up to this length are seen by a camera that stands still
 GLIDE_S = 0.25  # of longer ones it follows the trunk, smoothed over this time
 SHOWN_M = -6.0, 8.0  # of the ground
 FINER = 2  # frames are drawn larger by this, and averaged
-COLORS = 200  # of a GIF: more is larger, and looks the same
+COLORS = 200  # of a GIF: with 64 the shading of bodies shows bands, more is larger
 # lines across the ground, where the toes start and land, and every so often
 MARK_RGBA = (0.835, 0.369, 0.0, 1.0)
 LINE_RGBA = (0.62, 0.66, 0.72, 1.0)

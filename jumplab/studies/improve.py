@@ -13,14 +13,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.arguments import real
 from jumplab.errors import InputError, RobotError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
 from jumplab.robot import Robot
-from jumplab.robot.files import LEG
+from jumplab.robot.legs import segments_m
 from jumplab.stages.whole_body.starts import RECORD, SEEKING, Asked, from_solved
 from jumplab.studies.prices import Pricer
 
@@ -32,7 +31,7 @@ STEP = 0.08  # share by which a number is moved at first
 PROBE = 0.005  # share by which it is moved to have its price
 MOST_STEPS = 40
 SMALLEST = 0.002  # step that is worth another record
-PARTS = {"thigh_m": LEG[:2], "shank_m": LEG[1:]}  # from a joint to the next
+PARTS = "thigh_m", "shank_m"
 
 
 @dataclass(frozen=True)
@@ -201,7 +200,7 @@ def _numbers(robot: Robot, free: Mapping[str, Any]) -> list[_Free]:
             sizes = {key: 1.0 for key in rows}
         elif kind in PARTS:
             rows = {kind: given}
-            sizes = {kind: _length(robot, *PARTS[kind])}
+            sizes = {kind: segments_m(robot)[PARTS.index(kind)]}
         else:
             rows = given if isinstance(given, Mapping) else {None: given}
             sizes = {key: _mass(robot, key) for key in rows}
@@ -232,15 +231,6 @@ def _ends(word: str, ends: Any) -> tuple[float, float]:
     if not 0 < low < high:
         raise InputError(f"the ends of {word} must be positive and in order, got {quoted(ends)}")
     return low, high
-
-
-def _length(robot: Robot, here: str, there: str) -> float:
-    """From a joint of the left leg to the next [m]."""
-    model = robot.model
-    data = model.createData()
-    pin.forwardKinematics(model, data, pin.neutral(model))
-    first, last = (model.getJointId(robot.joints[role][0]) for role in (here, there))
-    return float(np.linalg.norm(data.oMi[last].translation - data.oMi[first].translation))
 
 
 def _mass(robot: Robot, link: Any) -> float:

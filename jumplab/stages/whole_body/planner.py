@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -216,10 +217,13 @@ class WholeBodyPlanner:
         attempts = []
         with unexplained():
             for start in COMPARED[:count]:
+                began = time.process_time()
                 try:
                     body = self.plan(task, starts=[start], **options)
                 except SolverError as e:
-                    attempts.append(Attempt(start.name, start.hessian, e.iterations, 0.0, e.status))
+                    took = time.process_time() - began
+                    failed = Attempt(start.name, start.hessian, e.iterations, took, e.status)
+                    attempts.append(failed)
                     continue
                 plans.append(body)
                 *first, last = body.attempts

@@ -205,6 +205,7 @@ WEIGHT_UNITS = {
     "jerk": "(rad/s^3)^-2/s",
     "torque": "(N m)^-2/s",
     "force": "N^-2/s",
+    "posture": "1/s",
     "mirror": "1/s",
     "track_velocity": "(m/s)^-2/s",
     "track_inertia": "1/s",
