@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from jumplab.arguments import checked
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.robot.legs import size
 from jumplab.robot.motors import MotorLimits
 from jumplab.show.bodies import Silhouette, draw_ground, draw_path, film_strip
 from jumplab.show.shapes import pressure_points, trace
@@ -209,10 +210,10 @@ def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
     """Torque against speed of each joint in its envelope; CoP in the sole and friction used through
     the launch.
 
-    ``limits`` are the planner's (its defaults if None), drawn dashed inside what the motors could
+    ``limits`` are the planner's (its defaults for the robot if None), drawn dashed inside what the motors could
     do.
     """
-    limits = limits or Limits()
+    limits = limits or Limits().of_size(size(robot))
     joints = _joints(tape, robot)
     motors = robot.limits
     panels = [*joints, "cop", "friction"]
@@ -275,10 +276,10 @@ def active(plan: JumpPlan, limits: Limits | None = None) -> Figure:
     """Which limit of a plan binds when: a bar while a joint, a foot or the friction uses all that
     the planner may use, in the colour of the phase.
 
-    ``limits`` are the planner's, its defaults if None. Bars of left and right are one.
+    ``limits`` are the planner's, its defaults for the robot if None. Bars of left and right are one.
     """
     tape = plan.tape
-    rows = _used_up(tape, plan.robot, limits or Limits())
+    rows = _used_up(tape, plan.robot, limits or Limits().of_size(size(plan.robot)))
     rows = {name: used for name, used in rows.items() if used.any()}
     names = sorted(rows, key=lambda name: -int(np.argmax(rows[name])))
     fig = new_figure(PAGE_IN, 0.9 + 0.2 * len(names))
