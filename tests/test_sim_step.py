@@ -9,6 +9,7 @@ from fixtures_core import jump
 
 from jumplab.control.landing import SOLE_SHARE
 from jumplab.control.step import BESIDE_M, SWING_S, RecoveryStep, beyond_hull
+from jumplab.robot.legs import Size
 from jumplab.sim import INSTALLED, Perturbation, Shove, simulate_jump
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trials
 
@@ -31,6 +32,7 @@ def body(com=(0.0, 0.0, 0.8), velocity=(0.0, 0.0, 0.0), turned_rad=0.0):
         attitudes=np.array([turn, turn]),
         twists=np.zeros((2, 6)),
         gravity=np.array([0.0, 0.0, -9.8]),
+        size=Size(1.0, 1.0),
     )
 
 

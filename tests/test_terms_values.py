@@ -751,7 +751,9 @@ def test_every_weight_is_the_setting_of_its_name(body, programs, rod):
             share = {"inertia", "momentum"} & set(t.name.split())
             want = w[key or t.name.replace(" ", "_")] / (stood**2 if share else 1.0)
             assert t.weight == pytest.approx(want, rel=1e-9), (owner, t.name)
-    assert set(w) == {"mirror", "track_flight_inertia_rate", "track_duration"} | {
+    # of uneven motions, robots with a waist, flights, and the whole problem
+    others = {"mirror", "posture", "track_flight_inertia_rate", "track_duration"}
+    assert set(w) == others | {
         t.name.replace(" ", "_") for _, t in programs["whole body"].terms() if t.is_cost
     }
     for owner, t in rod.terms():
