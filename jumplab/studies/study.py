@@ -252,7 +252,7 @@ def _by_cluster(client: Any, work: Sequence[Task], order: str) -> Iterator[Any]:
 
     futures = [client.submit(_done, task, pure=False) for task in work]
     try:
-        for future in futures if order == "generator" else as_completed(futures):
+        for future in futures if order == "generator" else as_completed(futures, loop=client.loop):
             yield future.result()
     except (KilledWorker, OSError) as e:
         raise JumplabError(
