@@ -137,6 +137,24 @@ def test_small_and_large_robots_jump_alike(size):
     assert run.metrics.foot_distance_m == pytest.approx(task.distance_m, abs=0.01 * size)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "asked"), [
+    (0.42, {"distance_m": 0.4, "height_m": 0.4, "platform_m": 0.2}),
+    (0.42, {"distance_m": 0.0, "height_m": 0.5, "rotation_rad": -2 * math.pi}),
+    (1.5, {"distance_m": 0.3, "height_m": 0.3, "side_m": 0.2}),
+], ids=["small, up", "small, backflip", "large, aside"])  # fmt: skip
+def test_small_and_large_robots_keep_limits_of_their_size(size, asked):
+    """Up, over and aside, with the same settings; and the audit sees a CoP that leaves a small sole."""
+    robot = grown_robot(size).with_limits(speed=1 / math.sqrt(size))
+    plan = jl.plan(JumpTask(**{k: v * size if k.endswith("_m") else v for k, v in asked.items()}), robot)
+    assert plan.audit.passed, plan.audit.line()
+    f = np.array(plan.tape.f)
+    f[..., 4] -= (robot.foot.toe - robot.foot.heel) * f[..., 2]  # a whole sole further ahead
+    found = audit(replace(plan.tape, f=f), robot, plan.task)
+    assert not found["CoP in the sole"].passed
+    assert found["foot clearance"].limit == pytest.approx(20 * size)
+
+
 # tape -----------------------------------------------------------------------------------------------------------
 def placed(x: Tape, place: pin.SE3) -> Tape:
     """A tape in another place of the world, turned about the vertical."""

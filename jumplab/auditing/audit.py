@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from jumplab.arguments import real
 from jumplab.auditing import contact, dynamics, motion
 from jumplab.auditing.replay import open_tape, replay
-from jumplab.auditing.report import LIMITS, AuditReport, Check, Measure
+from jumplab.auditing.report import LIMITS, AuditReport, Check, Limit, Measure, of_size
 from jumplab.errors import InputError, as_path, require_type
 from jumplab.io.files import write_file
 from jumplab.io.folder import CONFIG, PLAN, SUMMARY, URDF, read_json, sha256, versions
@@ -41,8 +41,9 @@ def audit(
 ) -> AuditReport:
     """Audit a finished plan with nothing but its tape and the robot's URDF.
 
-    Every quantity is recomputed with Pinocchio on the tape's own 1 kHz grid. A tape with numbers
-    that are not finite, or with phases out of order, gets a report with these two checks alone.
+    Every quantity is recomputed with Pinocchio on the tape's own 1 kHz grid; limits are those of
+    ``limits.toml``, some of which grow with the robot. A tape with numbers that are not finite, or
+    with phases out of order, gets a report with these two checks alone.
     Raises :class:`InputError` if the tape belongs to another robot (joints, sizes or contact frames
     differ).
 
@@ -64,7 +65,8 @@ def audit(
     capture = []
     if all(c.passed for c in checks):
         r = replay(tape, robot, task, edge_m)
-        checks += _checks(measure for group in GROUPS for measure in group(r))
+        limits = of_size(robot)[1]
+        checks += _checks((measure for group in GROUPS for measure in group(r)), limits)
         capture = _checks(motion.capture(r))
     manifest = {
         "robot": robot.name,
@@ -76,8 +78,8 @@ def audit(
     return AuditReport(tuple(checks), manifest, *capture)
 
 
-def _checks(measures: Iterable[Measure]) -> list[Check]:
-    return [LIMITS[name].check(*values) for name, *values in measures]
+def _checks(measures: Iterable[Measure], limits: Mapping[str, Limit] = LIMITS) -> list[Check]:
+    return [limits[name].check(*values) for name, *values in measures]
 
 
 def write_audit(

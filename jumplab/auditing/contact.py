@@ -43,7 +43,7 @@ def places(r: Replay) -> Iterator[Measure]:
 def pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
     """CoP on the ground (N, K, 2) [m], nan without load, and torsion about it (N, K) [N m]."""
     fx, fy, fz, mx, my, mz = np.moveaxis(r.tape.f, -1, 0)
-    up = np.where(fz > METHOD.cop_force_n, fz, np.nan)
+    up = np.where(fz > r.method.cop_force_n, fz, np.nan)
     # where a foot stands on a step its CoP is up there
     down = r.surface(r.along(r.toe_corners.mean(axis=2))) - r.foot[..., 2]
     dx = (down * fx - my) / up
@@ -57,7 +57,7 @@ def pressure(r: Replay) -> Iterator[Measure]:
     feet = r.tape.contact_frames
     friction = LIMITS["friction used"].limit
     load = r.tape.f[..., 2]
-    loaded = load > METHOD.cop_force_n
+    loaded = load > r.method.cop_force_n
     cop, torsion = pressure_points(r)
     toe, heel = (x[..., :2].mean(axis=2) for x in (r.toe_corners, r.heel_corners))
     heading = r.foot_rotation[..., :2, 0]  # (N, K, 2) heel to toe
@@ -67,14 +67,15 @@ def pressure(r: Replay) -> Iterator[Measure]:
     length = ((toe - heel) * heading).sum(-1)  # of the sole, seen from above
     aside = np.abs(((cop - toe) * side).sum(-1)) - [(s.left - s.right) / 2 for s in r.soles]
     outside = np.maximum.reduce([ahead, -ahead - length, aside])
-    raised = 1e3 * r.heel_corners[..., 2].min(axis=-1) > METHOD.heel_up_mm
+    raised = 1e3 * r.heel_corners[..., 2].min(axis=-1) > r.method.heel_up_mm
     some = loaded.any(axis=1)  # rows with something to check
-    twist = np.abs(torsion) / (friction * METHOD.torsion_arm_m * np.where(loaded, load, 1.0))
-    used = norm(r.tape.f[..., :2]) / np.maximum(load, METHOD.friction_force_n)
-    yield "CoP in the sole", np.where(loaded, outside, -np.inf)[some], t[some], feet
-    yield "CoP at the toe", np.where(loaded & raised, np.abs(ahead), 0.0), t, feet
-    yield "torsional friction", np.where(loaded, twist, 0.0), t, feet, {"friction": friction}
-    yield "friction used", used, t, feet
+    twist = np.abs(torsion) / (friction * r.method.torsion_arm_m * np.where(loaded, load, 1.0))
+    used = norm(r.tape.f[..., :2]) / np.maximum(load, r.method.friction_force_n)
+    numbers = vars(r.method) | {"friction": friction}
+    yield "CoP in the sole", np.where(loaded, outside, -np.inf)[some], t[some], feet, numbers
+    yield "CoP at the toe", np.where(loaded & raised, np.abs(ahead), 0.0), t, feet, numbers
+    yield "torsional friction", np.where(loaded, twist, 0.0), t, feet, numbers
+    yield "friction used", used, t, feet, numbers
     yield "ground only pushes", -load, t, feet
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.report import METHOD
+from jumplab.auditing.report import METHOD, of_size
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -74,6 +75,11 @@ class Replay:
     def coordinates(self) -> tuple[str, ...]:
         """(nv,) names of the columns of v."""
         return (*BASE, *self.joints)
+
+    @cached_property
+    def method(self) -> SimpleNamespace:
+        """Numbers of the audit that are no limits, for a robot of this size."""
+        return of_size(self.robot)[0]
 
     @cached_property
     def gravity(self) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from jumplab.errors import Shown
 from jumplab.io.folder import to_json
+from jumplab.robot import Robot
+from jumplab.robot.legs import size
 
 SCHEMA = "jumplab-passport-1"
 
@@ -73,16 +75,32 @@ class Limit:
             worst = float(x[at]) * SCALES.get(self.unit.split()[0].rstrip(","), 1.0) + 0.0  # no -0
             time = None if t is None else float(np.ravel(t)[at[0] if at else 0])
             where = f"; worst: {labels[at[1]]}" if labels is not None else ""
-        note = self.note.format(**vars(METHOD), **(numbers or {})) + where
+        note = self.note.format(**vars(METHOD) | dict(numbers or {})) + where
         return Check(self.group, self.name, worst, self.limit, self.unit, time, note, self.at_least)
 
 
 SCALES = {"mm": 1e3, "mrad": 1e3, "ms": 1e3, "%": 100.0}  # from SI to the units of limits
 _TABLE = tomllib.loads(Path(__file__).with_name("limits.toml").read_text(encoding="utf-8"))
 METHOD = SimpleNamespace(**_TABLE.pop("method"))  # its numbers that are no limits
+_GROWS = _TABLE.pop("grows")  # name of a number of METHOD or a limit -> its unit in `UNITS`
 LIMITS = {
     name: Limit(group, name, *row) for group, rows in _TABLE.items() for name, row in rows.items()
 }
+
+
+def of_size(robot: Robot) -> tuple[SimpleNamespace, dict[str, Limit]]:
+    """:data:`METHOD` and :data:`LIMITS` as they are for a ``robot`` of its size."""
+    large = size(robot)
+    method = vars(METHOD).copy()
+    limits = LIMITS.copy()
+    for name, unit in _GROWS.items():
+        if name in method:
+            method[name] = large.of(method[name], unit)
+        else:
+            limits[name] = replace(limits[name], limit=large.of(limits[name].limit, unit))
+    return SimpleNamespace(**method), limits
+
+
 # what a group of checks yields: the name of a limit, then the arguments of its ``check``
 Measure = tuple[Any, ...]
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.control.kinematics import Gauge
+from jumplab.robot.legs import size
 from jumplab.robot.stance import knees
 from jumplab.sim import STEP_S
 from jumplab.sim.checks import LOADED_N, friction_used, ground_of
@@ -76,7 +77,8 @@ def _lasting(flags: np.ndarray, time_s: float) -> int | None:
 
 def _slip(result: SimulationResult, until: int) -> int | None:
     gauge = Gauge(result.robot)
-    sliding = result.foot_wrench[:until, :, 2] > LOADED_N
+    least = size(result.robot).of(LOADED_N, "N")
+    sliding = result.foot_wrench[:until, :, 2] > least
     row, side = np.nonzero(sliding)
     if len(row):
         feet = np.array([[foot.translation for foot in gauge.places(q)] for q in result.q[:until]])

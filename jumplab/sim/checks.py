@@ -18,6 +18,7 @@ from jumplab.control.kinematics import Gauge, rotation
 from jumplab.robot import Robot
 from jumplab.robot.contact import WORLD, on_feet
 from jumplab.robot.description import Foot
+from jumplab.robot.legs import size
 from jumplab.sim import CONTACTS, STEP_S
 from jumplab.sim.armature import Armature
 from jumplab.sim.result import STAND_S, Finding, SimulationResult, stray
@@ -33,7 +34,7 @@ SWING = 3.0
 # [rad/s] from here on dry friction is there in full: engines let it grow over some tenths
 SLIDES = 0.5
 STOP_RAD = 0.02  # this close to its stop, a joint may lean on it
-LOADED_N = 50.0  # below it, CoP and friction ratio are rounding
+LOADED_N = 50.0  # of a 42 kg robot: below it, CoP and friction ratio are rounding
 # [1] a sole that is turned by less than 45 degrees is what touches the ground of a foot
 FACING = 0.7
 
@@ -246,7 +247,8 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[float, float]:
     """From the measured wrenches, the most friction that a foot uses [1], and how far its CoP ever
     lies outside the sole [m].
     """
-    loaded, side = np.nonzero(result.foot_wrench[:-1, :, 2] > LOADED_N)
+    least = size(robot).of(LOADED_N, "N")
+    loaded, side = np.nonzero(result.foot_wrench[:-1, :, 2] > least)
     if not len(loaded):
         return 0.0, 0.0
     ground = ground_of(result)

@@ -6,11 +6,12 @@ import numpy as np
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.robot.legs import size
 from jumplab.stages.whole_body.ground import Surface
 from jumplab.stages.whole_body.tape import FLAT, SHORTEST_S, feet_of
 from jumplab.stages.whole_body.terms import SOLE_SHARES
 
-# the audit's limits
+# the audit's limits; forces, rates, accelerations and the clearance grow with the robot
 FRICTION = 0.5  # of each foot
 LOADED_N = 10.0  # the ratio is taken to this force at least
 RATE_GAP = 0.01  # [rad/s] of angles over one step, against the mean of the rates at its ends
@@ -32,6 +33,7 @@ def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> floa
     twice of it.
     """
     motors = robot.limits
+    of = size(robot).of
     angles = tape.q[:, 7:]
     rates = tape.v[:, 6:]
     least, most = motors.range(rates)
@@ -41,10 +43,10 @@ def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> floa
         1 + np.maximum(tape.tau - most, least - tape.tau) / motors.effort,
         np.abs(rates) / motors.speed,
         np.maximum(motors.lower - angles, angles - motors.upper) / RANGE_GAP,
-        along / (FRICTION * np.maximum(tape.f[..., 2], LOADED_N)),
+        along / (FRICTION * np.maximum(tape.f[..., 2], of(LOADED_N, "N"))),
         _pressed_outside(tape, robot, turn) / PRESSURE_GAP,
-        _gap(tape.t, angles, rates) / RATE_GAP,
-        _gap(tape.t, rates, tape.a[:, 6:]) / ACCELERATION_GAP,
+        _gap(tape.t, angles, rates) / of(RATE_GAP, "rad/s"),
+        _gap(tape.t, rates, tape.a[:, 6:]) / of(ACCELERATION_GAP, "rad/s^2"),
         _low(tape, robot, surface, origin, turn),
     ]
     return float(max(x.max() for x in shares))
@@ -66,7 +68,8 @@ def _pressed_outside(tape: Tape, robot: Robot, turn: np.ndarray) -> np.ndarray:
     """
     foot = robot.foot
     force = tape.f[..., :3]
-    load = np.where(force[..., 2] > PRESSED_N, force[..., 2], np.nan)
+    least = size(robot).of(PRESSED_N, "N")
+    load = np.where(force[..., 2] > least, force[..., 2], np.nan)
     moment = tape.f[..., 3:] - np.cross(turn @ foot.tip, force)
     x = -moment[..., 1] / load  # from the middle of the toe edge
     y = moment[..., 0] / load
@@ -85,6 +88,7 @@ def _low(
 
     ``origin`` (n, 2, 3) [m] and ``turn`` (n, 2, 3, 3) are places and attitudes of the feet.
     """
+    clear = size(robot).of(CLEAR_M, "m")
     heels, toes = np.split(robot.foot.corners, 2)
     sole = np.concatenate([heels + share * (toes - heels) for share in SOLE_SHARES])
     points = origin[:, :, None] + np.einsum("nkij,pj->nkpi", turn, sole)
@@ -96,5 +100,5 @@ def _low(
             continue
         t = tape.t[rows] - tape.t[rows[0]]
         middle = (t >= MIDDLE[0] * t[-1]) & (t <= MIDDLE[1] * t[-1])
-        shares[rows] = np.where(middle[:, None], 2 - height[rows] / CLEAR_M, -height[rows] / SUNK_M)
+        shares[rows] = np.where(middle[:, None], 2 - height[rows] / clear, -height[rows] / SUNK_M)
     return shares
