@@ -9,6 +9,7 @@ import pytest
 from test_judge import CLIPS, NO_ROBOTS, standing
 
 import jumplab as jl
+from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.io import export
 from jumplab.io.motion import Motion
@@ -111,6 +112,13 @@ def test_what_no_clip_shows_is_refused():
         jl.plan(GOAL, "g1", like=CLIPS / "side_jump_level2.pkl")
     with pytest.raises(InputError, match="leave method, robust and starts out, and give one of both"):
         jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl", method="three-step")
+
+
+@NO_ROBOTS
+def test_the_command_plans_in_the_manner_of_a_clip(tmp_path, capsys):
+    clip = str(CLIPS / "side_jump_level2.pkl")
+    assert main(["plan", "--robot", "g1", "--like", clip, "--out", str(tmp_path)]) == 2
+    assert "its feet carry as LR R r - L LR" in capsys.readouterr().err
 
 
 @NO_ROBOTS

@@ -164,6 +164,8 @@ def test_commands_take_a_schedule_by_its_name(tmp_path, capsys):
         assert said in capsys.readouterr().err
     assert main(["plan", "--contacts", "hop", "--side-m", "0.2", "--out", out]) == 2
     assert "--side-m is part of a target, and --contacts gives a schedule instead" in capsys.readouterr().err
+    assert main(["plan", "--contacts", "hop", "--like", "clip.pkl", "--out", out]) == 2
+    assert "--like is part of a target" in capsys.readouterr().err
 
 
 def test_what_a_page_says_of_one_foot():

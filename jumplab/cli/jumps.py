@@ -73,7 +73,8 @@ def plan(args: Namespace) -> None:
     if args.contacts:
         why = "is part of a target, and --contacts gives a schedule instead"
         without(args, why, **{f.name: f.default for f in fields(JumpTask)[2:]})
-        without(args, why, distance_m=1.0, height_m=0.5, robust=False, atlas=None, starts=1)
+        without(args, why, distance_m=1.0, height_m=0.5, like=None)
+        without(args, why, robust=False, atlas=None, starts=1)
         task = None
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
