@@ -232,8 +232,8 @@ FIT = {
 SLOW = "record", "run_trials", "run_chain", "mend", "Atlas.build", "Planner.plan", "Planner.replan", "plan", "simulate"
 
 
-def public(robot):
-    """Name -> every public function, class and method that takes something."""
+def public(robot, slow=False):
+    """Name -> every public function, class and method that takes something; ``slow`` ones as well, or not."""
     objects = {"Scene": Scene.flat(), "Robot": robot, "Planner": jl.Planner(robot), "JumpTask": jl.JumpTask(0.4, 0.3)}
     objects |= {"Contacts": jl.Contacts.hop(robot), "Perturbation": jl.Perturbation()}
     out = {name: getattr(jl, name) for name in jl.__all__ if callable(getattr(jl, name))}
@@ -243,7 +243,7 @@ def public(robot):
             methods = {m for m in vars(kind) if not m.startswith("_") and callable(getattr(of, m, None))}
             out |= {f"{name}.{m}": getattr(of, m) for m in methods if inspect.isroutine(vars(kind)[m])}
     out |= {f"plots.{m}": getattr(jl.plots, m) for m in dir(jl.plots) if inspect.isfunction(getattr(jl.plots, m))}
-    called = {name: takes(call) for name, call in out.items() if name not in SLOW}
+    called = {name: takes(call) for name, call in out.items() if slow or name not in SLOW}
     return {name: out[name] for name, parameters in called.items() if parameters and "self" not in parameters}
 
 

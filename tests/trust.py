@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from damage import calls, folders
 from shots import kills, signals
 
 from jumplab.io.files import open_log
@@ -22,7 +23,12 @@ from jumplab.studies.study import code
 # does case number k, drawn by a generator, and returns its row; "fault" is empty if there is none
 Case = Callable[[int, random.Random], dict[str, Any]]
 # name -> (what makes the cases, given a folder to work in; usual number of cases)
-KINDS: dict[str, tuple[Callable[[Path], Case], int]] = {"signals": (signals, 300), "kills": (kills, 100)}
+KINDS: dict[str, tuple[Callable[[Path], Case], int]] = {
+    "calls": (calls, 5000),
+    "folders": (folders, 200),
+    "signals": (signals, 300),
+    "kills": (kills, 100),
+}
 
 
 def measure(kind: str, folder: Path, count: int | None = None) -> int:
