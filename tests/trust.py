@@ -16,6 +16,7 @@ from typing import Any
 
 from damage import calls, folders
 from shots import kills, signals
+from together import together
 
 from jumplab.io.files import open_log
 from jumplab.studies.study import code
@@ -28,6 +29,7 @@ KINDS: dict[str, tuple[Callable[[Path], Case], int]] = {
     "folders": (folders, 200),
     "signals": (signals, 300),
     "kills": (kills, 100),
+    "together": (together, 10),
 }
 
 
