@@ -25,7 +25,6 @@ import jumplab as jl
 from jumplab.cli import main as cli
 from jumplab.errors import JumplabError
 from jumplab.io import folder as store
-from jumplab.show import shapes
 from jumplab.sim import Ranges, Scene
 from jumplab.studies.chain import Course
 from jumplab.studies.trials import TrialSettings
@@ -82,7 +81,7 @@ def calls(folder: Path) -> Callable:
     ax = jl.plots.new_figure().subplots()
     fit = FIT | dict(
         robot=robot, ax=ax, axes=[ax], fig=ax.figure, folder=folder / "none", task=plan.task, plan=plan, run=run,
-        tape=tape, record=run, body=shapes.Silhouette(robot), result=run, x=plan, name_or_path="bhr", urdf=robot.urdf,
+        tape=tape, record=run, body=jl.plots.Silhouette(robot), result=run, x=plan, name_or_path="bhr", urdf=robot.urdf,
         config_text=robot.config_text, motion=good(folder) / "clip.npz", previous=plan, rows=[{"a": 1.0}], q=tape.q[0],
         strength=1.0, place=np.zeros(2), t=tape.t, y=tape.t, phase=tape.phase, angles=np.zeros(5), left=0.0, right=1.0,
         times=[0.1], handles=[], frames=tape.q[:3], colors=["#102030"] * 3, places=np.zeros((3, 2)), name="x", of=plan,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import random
 import threading
 import time
@@ -19,7 +18,6 @@ import numpy as np
 from shots import good
 
 import jumplab as jl
-from jumplab.io import folder as store
 from jumplab.studies.envelope import envelope
 
 PROCESSES, THREADS, ROUND_S = 4, 4, 60.0
