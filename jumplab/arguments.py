@@ -106,11 +106,13 @@ def _checking(function: F) -> F:
             raise InputError(f"{called}: {e}; it takes {names or 'nothing'}") from None
         for name, value in given.arguments.items():
             parameter = signature.parameters[name]
-            if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
-                continue
+            hint = _hint(parameter.annotation, function)
             default = parameter.default
-            if value is not default and not (isinstance(value, float) and value == default):
-                hint = _hint(parameter.annotation, function)
+            if parameter.kind is parameter.VAR_KEYWORD:
+                given.arguments[name] = {k: fitting(x, hint, k) for k, x in value.items()}
+            elif parameter.kind is parameter.VAR_POSITIONAL:
+                given.arguments[name] = tuple(fitting(x, hint, name) for x in value)
+            elif value is not default and not (isinstance(value, float) and value == default):
                 given.arguments[name] = fitting(value, hint, name)
         return function(*given.args, **given.kwargs)
 

@@ -1,70 +1,33 @@
-"""Ctrl-C and SIGTERM at random moments: every command ends, and nothing new has been written.
+"""Ctrl-C, SIGTERM and SIGKILL at random moments: every command ends, and no result is half written.
 
-JUMPLAB_SHOTS=200 sets how many commands are shot; the everyday run makes do with a few.
+``python tests/trust.py signals DIR`` sends hundreds to all commands; here are a few to quick ones.
 """
 
-import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
-from test_kills import ROOT, command, folder, starting  # noqa: F401 - a fixture
 from test_store import names
+from trust import KINDS
 
 from jumplab.cli import main as cli
 from jumplab.cli.interrupts import Stopped
 from jumplab.io import files
 
-SHOTS = int(os.environ.get("JUMPLAB_SHOTS", "5"))
-CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
-LOGS = {"cases.jsonl", "trials.jsonl"}  # finished pieces of work are kept
-
-
-def commands(place, plan):
-    """Name -> arguments, and how long it takes at least on a quiet machine [s]."""
-    return {
-        "plan": (["plan", "--height-m", "0.4", "--out", place / "p"], 3.0),
-        "direct": (["plan", "--method", "direct", "--out", place / "p"], 3.0),
-        "side": (["plan", "--side-m", "0.2", "--distance-m", "0.2", "--height-m", "0.3", "--out", place / "p"], 6.0),
-        "run": (["run", "00", "--out", place / "r"], 10.0),
-        "bench": (["bench", "--repeats", "1", "--out", place / "b.json"], 10.0),
-        "sweep": (["sweep", "--distance-m", "0.3:1:9", "--height-m", "0.4", "--jobs", "2", "--out", place / "s"], 8.0),
-        "trials": (["trials", plan, "--n", "4", "--jobs", "2"], 8.0),
-        "chain": (["chain", "--distance-m", "0.4,0.4", "--out", place / "c"], 10.0),
-    }
-
-
-def content(place):
-    return {p.relative_to(place): p.read_bytes() for p in place.rglob("*") if p.is_file() and p.name not in LOGS}
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.mark.slow
-def test_random_moments(folder, tmp_path_factory):  # noqa: F811
-    rng = random.Random(11)
-    for k in range(SHOTS):
-        place = tmp_path_factory.mktemp("shot")
-        shutil.copytree(folder, place / "plan")
-        every = commands(place, place / "plan")
-        name = list(every)[k % len(every)]
-        arguments, longest = every[name]
-        number, before = rng.choice(list(CODES)), content(place)
-        process = command(list(map(str, arguments)), place)
-        try:
-            process.wait(rng.uniform(0.2, longest))
-        except subprocess.TimeoutExpired:
-            process.send_signal(number)
-        said = process.communicate(timeout=60)[1]
-        told = (name, number.name, process.returncode, said)
-        if starting(said):
-            said, process.returncode = "", CODES[number]
-        assert "Traceback" not in said and said.count("\n") <= 1, told
-        assert process.returncode in (0, CODES[number]), told
-        if process.returncode:
-            assert content(place) == before, told
-        shutil.rmtree(place)
+@pytest.mark.parametrize("kind", ["signals", "kills"])
+def test_random_moments(kind, tmp_path):
+    """Commands end in a sentence, and leave the old result or the new one, whole."""
+    case = KINDS[kind][0](tmp_path)
+    for number in range(100, 106):
+        row = case(number, random.Random(number))
+        assert not row["fault"], row
 
 
 def heeding():

@@ -275,9 +275,7 @@ def test_toes_are_held_and_belong_to_the_sole(put, shank):
         toe = f'<link name="{side}_toe"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" '
         toe += 'ixz="0" iyz="0"/></inertial><collision><origin xyz=".03 0 -.01"/><geometry><box size=".06 .08 .03"/>'
         toe += f'</geometry></collision></link><joint name="{side}_toe" type="revolute"><child link="{side}_toe"/>'
-        toe += (
-            f'<parent link="{side}_ankle_roll_link"/><origin xyz=".13 0 -.04"/><axis xyz="0 1 0"/><limit '
-        )
+        toe += f'<parent link="{side}_ankle_roll_link"/><origin xyz=".13 0 -.04"/><axis xyz="0 1 0"/><limit '
         text = text.replace("</robot>", toe + 'lower="-.5" upper=".5" effort="9" velocity="9"/></joint></robot>')
         ankle = f'<child link="{side}_ankle_pitch_link"/><origin xyz="0 0 '
         text = changed(text, (f"{ankle}-0.31", f"{ankle}{shank}"))

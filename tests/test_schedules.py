@@ -15,6 +15,8 @@ from jumplab.errors import InfeasibleError, InputError
 from jumplab.sim import INSTALLED
 
 AIR, TOE, FLAT = 0, 1, 2
+
+
 @cache
 def hop() -> jl.JumpPlan:
     robot = jl.Robot.load()

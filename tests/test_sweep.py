@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import joblib
 import pytest
 from test_cli import one_sentence, run
 from test_store import names
@@ -16,7 +17,7 @@ from test_store import names
 from jumplab.cli.common import values_of
 from jumplab.cli.studies import choices_of
 from jumplab.errors import InputError
-from jumplab.studies import sweep
+from jumplab.studies import study, sweep
 from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -115,18 +116,41 @@ def test_killed_for_good(tmp_path):
 
 @pytest.mark.slow
 def test_the_same_on_a_cluster(tmp_path):
-    """A local Dask cluster gives the rows that this process gives."""
+    """A local Dask cluster, one worker of two threads, gives the rows that this process gives."""
     distributed = pytest.importorskip("distributed")
     with pytest.raises(InputError, match=r"^no Dask scheduler answers at 'nowhere:1' "):
         sweep.run(sweep.grid([0.3], [0.3]), tmp_path, cluster="nowhere:1", progress=False)
-    cases = sweep.grid([0.3, 0.5], [0.3])
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster:
+    cases = sweep.grid([0.3, 0.4, 0.5], [0.3])
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=":0") as cluster:
         far = sweep.run(cases, tmp_path / "far", cluster=cluster.scheduler_address, progress=False)
     near = sweep.run(cases, tmp_path / "near", jobs=1, progress=False)
     for a, b in zip(far, near, strict=True):
         assert a["clean"] and b["clean"]
         assert (a["distance_m"], a["iterations"]) == (b["distance_m"], b["iterations"])
         assert a["cost"] == pytest.approx(b["cost"], rel=1e-9)
+
+
+def where(k):
+    return k, os.getpid()
+
+
+@pytest.mark.slow
+def test_a_cluster_of_any_shape_is_used_if_it_has_the_same_code(monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    work = [joblib.delayed(where)(k) for k in range(4)]
+    for workers in (1, 2):
+        with distributed.LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0") as cluster:
+            with study.on_cluster(cluster.scheduler_address):
+                found = sorted(study.in_parallel(work, 1))
+            assert [k for k, _ in found] == [0, 1, 2, 3] and os.getpid() not in {pid for _, pid in found}
+            if workers == 1:
+                monkeypatch.setattr(study, "code", lambda: "another")
+                refused = pytest.raises(
+                    InputError, match=r"^worker \S+ has code \w+, this process another; install the same"
+                )
+                with refused, study.on_cluster(cluster.scheduler_address):
+                    pass
+                monkeypatch.undo()
 
 
 def test_sweeps_share_a_log_and_do_not_mix(tmp_path, monkeypatch):

@@ -753,9 +753,7 @@ def test_every_weight_is_the_setting_of_its_name(body, programs, rod):
             assert t.weight == pytest.approx(want, rel=1e-9), (owner, t.name)
     # of uneven motions, robots with a waist, flights, and the whole problem
     others = {"mirror", "posture", "track_flight_inertia_rate", "track_duration"}
-    assert set(w) == others | {
-        t.name.replace(" ", "_") for _, t in programs["whole body"].terms() if t.is_cost
-    }
+    assert set(w) == others | {t.name.replace(" ", "_") for _, t in programs["whole body"].terms() if t.is_cost}
     for owner, t in rod.terms():
         assert not t.is_cost or t.weight == ROD_WEIGHTS[t.name], (owner, t.name)
 

@@ -270,9 +270,7 @@ def test_names_are_checked():
     problem.check_names(["mid row", "one/mid row", "rest", "toy/meet"], "switch")
     with pytest.raises(InputError) as e:
         problem.check_names(["mid rwo"], "switch")
-    assert str(e.value).startswith(
-        "switch 'mid rwo': the problem 'toy' has no such term; it has mid row, "
-    )
+    assert str(e.value).startswith("switch 'mid rwo': the problem 'toy' has no such term; it has mid row, ")
 
 
 def test_table_lists_every_term_and_bound():

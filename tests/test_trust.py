@@ -6,25 +6,29 @@ import json
 import os
 import random
 import resource
+import signal
 import struct
 import subprocess
 import sys
-import threading
+import time
 import zipfile
 from pathlib import Path
 
 import joblib
 import numpy as np
+import psutil
 import pytest
 from test_store import make_summary, make_tape
+from together import together
 
 import jumplab as jl
 from jumplab import reading
 from jumplab.errors import InputError, JumplabError
 from jumplab.io import folder as store
-from jumplab.io.files import ensure_writable
+from jumplab.io.files import ensure_writable, locked, open_log
 from jumplab.ocp import cache
 from jumplab.sim import Scene
+from jumplab.studies import clips, sweep
 from jumplab.studies.study import in_parallel, open_study
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -197,22 +201,115 @@ def test_workers_import_nothing_from_the_current_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_threads_take_turns():
-    """Landings of two threads share a solver, and two studies the processes."""
-    plan = jl.plan(jl.JumpTask(0.3, 0.2))
-    out = {}
+def test_processes_and_threads_do_everything_at_once(tmp_path, monkeypatch):
+    """A solver, an engine, a folder and the processes of a study are each shared by threads: results are equal."""
+    monkeypatch.setattr("together.ROUND_S", 5.0)
+    monkeypatch.setattr("together.PROCESSES", 2)
+    row = together(tmp_path)(0, random.Random(1))
+    assert not row["fault"] and row["calls"] >= 8, row
 
-    def work(k):
-        run = jl.simulate(plan, stand_s=0.1)
-        squares = sorted(in_parallel([joblib.delayed(_square)(x) for x in range(3)], 2))
-        out[k] = run.metrics.foot_distance_touchdown_m, squares
 
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert out[0] == out[1] and out[0][1] == [0, 1, 4]
+# processes ----------------------------------------------------------------------------------------------------------
+def ended(work, **limits):
+    """How a fork that does ``work`` within limits, such as CPU=30, has ended: its exit code, or minus a signal."""
+    child = os.fork()
+    if not child:
+        code = 99
+        try:
+            for name, value in limits.items():
+                resource.setrlimit(getattr(resource, f"RLIMIT_{name}"), (value, value))
+            code = work() or 0
+        except JumplabError:
+            code = 3
+        except MemoryError:
+            code = 4
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def _killed(x):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_is_told(tmp_path):
+    with pytest.raises(JumplabError, match=r"^a worker process was killed, perhaps for lack of memory; what was "):
+        list(in_parallel([joblib.delayed(_killed)(x) for x in range(2)], 2))
+    assert sorted(in_parallel([joblib.delayed(_square)(x) for x in range(3)], 2)) == [0, 1, 4]
+
+
+def test_many_processes_use_a_new_folder_at_once(bhr, tmp_path):
+    tape = make_tape(bhr, n=20)
+    for number in range(4):
+        place = tmp_path / str(number) / "new"
+        children = []
+        for _ in range(8):
+            if not (child := os.fork()):
+                code = 99
+                try:
+                    store.write_plan(place, tape, bhr, make_summary())
+                    store.read_plan(place)
+                    code = 0
+                finally:
+                    os._exit(code)
+            children.append(child)
+        assert [os.waitpid(child, 0)[1] for child in children] == 8 * [0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more_mb", [4, 12, 30])
+def test_a_solve_without_memory_ends(bhr, more_mb, monkeypatch):
+    """It has a plan, an error, or no memory; it does not go on for ever."""
+    monkeypatch.setenv("JUMPLAB_CACHE", "")
+    jl.Planner(bhr).plan(jl.JumpTask(0.3, 0.2))  # everything is imported
+    used = psutil.Process().memory_info().vms + (more_mb << 20)
+    cpu_s = int(time.process_time()) + 30
+    assert ended(lambda: jl.plan(jl.JumpTask(0.4, 0.3), bhr) and 0, AS=used, CPU=cpu_s) in (0, 3, 4)
+
+
+STREAMS = [
+    ("robot list > /dev/full", 4, None),
+    ("robot list >&-", 0, None),
+    ("robot list >&- 2>&-", 0, None),
+    ("robot list | true", 0, None),
+    ("plan --distance-m x --out p 2>&-", 2, None),
+    ("plan --distance-m x --out p 2> /dev/full", 2, None),
+    ("export jump --format csv --out a.csv <&- >&- 2>&-", 0, "a.csv"),
+    ("export jump --format csv --out a.csv > /dev/full 2> /dev/full", 4, "a.csv"),
+    ("envelope --distance-m 0.3,0.4 --height-m 0.2 --jobs 2 --out map <&- >&- 2>&-", 0, "map/envelope.json"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("line", "code", "made"), STREAMS)
+def test_streams_change_nothing(bhr, tmp_path, line, code, made):
+    """Closed, full or without a reader: the work is done, and its exit code is that of the page of commands."""
+    plan_folder(tmp_path / "jump", bhr)
+    shell = f"set -o pipefail; '{sys.executable}' -m jumplab {line}"
+    how = dict(cwd=tmp_path, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    done = subprocess.run(["bash", "-c", shell], **how)
+    sentence = "jumplab: the output cannot be written (No space left on device)\n" if code == 4 else ""
+    assert done.returncode == code and done.stderr == ("" if "2>" in line else sentence)
+    assert made is None or (tmp_path / made).stat().st_size > 0
+
+
+def test_two_commands_do_not_write_one_folder_at_once(bhr, tmp_path):
+    """The second says so, and changes nothing."""
+    logs = {
+        "envelope": ("cells.jsonl", lambda: jl.envelope(bhr, [0.3], [0.2], folder=tmp_path, progress=False)),
+        "atlas": ("cells.jsonl", lambda: jl.Atlas.build(bhr, [0.3, 0.4], [0.2, 0.3], folder=tmp_path, progress=False)),
+        "sweep": (sweep.CASES, lambda: sweep.run(sweep.grid([0.3], [0.3]), tmp_path, jobs=1, progress=False)),
+    }
+    for name, (log, call) in logs.items():
+        with open_log(tmp_path / log, name, lambda line: (line, line)) as first:
+            first.add({})
+            with pytest.raises(InputError, match=rf"another 'jumplab {name}' is writing it; wait until that is done$"):
+                call()
+        assert (tmp_path / log).read_text() == "{}\n" and [p.name for p in tmp_path.iterdir()] == [log]
+        (tmp_path / log).unlink()
+    with locked(tmp_path), pytest.raises(InputError, match="another jumplab is writing into"):
+        clips.make_clips(bhr, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 # wrong calls --------------------------------------------------------------------------------------------------------
@@ -232,8 +329,8 @@ FIT = {
 SLOW = "record", "run_trials", "run_chain", "mend", "Atlas.build", "Planner.plan", "Planner.replan", "plan", "simulate"
 
 
-def public(robot):
-    """Name -> every public function, class and method that takes something."""
+def public(robot, slow=False):
+    """Name -> every public function, class and method that takes something; ``slow`` ones as well, or not."""
     objects = {"Scene": Scene.flat(), "Robot": robot, "Planner": jl.Planner(robot), "JumpTask": jl.JumpTask(0.4, 0.3)}
     objects |= {"Contacts": jl.Contacts.hop(robot), "Perturbation": jl.Perturbation()}
     out = {name: getattr(jl, name) for name in jl.__all__ if callable(getattr(jl, name))}
@@ -243,7 +340,7 @@ def public(robot):
             methods = {m for m in vars(kind) if not m.startswith("_") and callable(getattr(of, m, None))}
             out |= {f"{name}.{m}": getattr(of, m) for m in methods if inspect.isroutine(vars(kind)[m])}
     out |= {f"plots.{m}": getattr(jl.plots, m) for m in dir(jl.plots) if inspect.isfunction(getattr(jl.plots, m))}
-    called = {name: takes(call) for name, call in out.items() if name not in SLOW}
+    called = {name: takes(call) for name, call in out.items() if slow or name not in SLOW}
     return {name: out[name] for name, parameters in called.items() if parameters and "self" not in parameters}
 
 

@@ -188,7 +188,10 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
     lines = []
     for rows in np.split(np.arange(len(phase)), cuts):
         look = {"color": PHASE_COLORS[str(phase[rows[0]])]} | kwargs
-        lines += ax.plot(t[rows], y[rows], **look)
+        try:
+            lines += ax.plot(t[rows], y[rows], **look)
+        except (AttributeError, TypeError, ValueError) as e:
+            raise InputError(f"no line can be drawn with {quoted(kwargs)}: {quoted(e)}") from e
     return lines
 
 
