@@ -66,8 +66,7 @@ def plan(heavy):
 
 # told ---------------------------------------------------------------------------------------------------------------
 def imported(told: str) -> Robot:
-    jumper = make_jumper(text(root()), read_toml(config("x") + told, "config"), "my.urdf")
-    return Robot.from_text(jumper.urdf, jumper.config_text)
+    return make_jumper(text(root()), read_toml(config("x") + told, "config"), "my.urdf")[0]
 
 
 def test_read_for_a_role_and_for_one_of_its_joints():

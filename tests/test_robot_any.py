@@ -40,8 +40,7 @@ def load(folder, variant, *args) -> Robot:
 
 
 def made(urdf: str, toml: str) -> Robot:
-    jumper = make_jumper(urdf, read_toml(toml, "config"), "my.urdf")
-    return Robot.from_text(jumper.urdf, jumper.config_text)
+    return make_jumper(urdf, read_toml(toml, "config"), "my.urdf")[0]
 
 
 # the models -----------------------------------------------------------------------------------------------------
@@ -60,10 +59,9 @@ def test_canted_hips_leave_the_plane(tmp_path):
 
 
 def test_a_robot_whose_sides_differ_is_left_as_it_is():
-    jumper = make_jumper(wider_left(), read_toml(config("x"), "config"), "my.urdf")
-    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    robot, lumped, _ = make_jumper(wider_left(), read_toml(config("x"), "config"), "my.urdf")
     said = "left and right differ, left as they are, places"
-    assert jumper.lumped.changed[said][0] == pytest.approx(50.0)
+    assert lumped.changed[said][0] == pytest.approx(50.0)
     assert not robot.planar
 
 
@@ -226,15 +224,13 @@ def test_what_cannot_be_meant_is_refused(urdf, toml, sentence):
 
 
 def test_small_differences_of_the_sides_are_evened_out():
-    toml = read_toml(config("x"), "config")
-    jumper = make_jumper(heavier_left(), toml, "my.urdf")
-    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    robot, lumped, _ = make_jumper(heavier_left(), read_toml(config("x"), "config"), "my.urdf")
     masses = [robot.model.inertias[robot.model.getJointId(f"{side}_knee")].mass for side in ("left", "right")]
     assert masses == pytest.approx([3.005, 3.005], abs=1e-12)
     hips = [robot.model.jointPlacements[robot.model.getJointId(f"{side}_hip_yaw")] for side in ("left", "right")]
     np.testing.assert_allclose([hip.translation[:2] for hip in hips], [[0.001, 0.1], [0.001, -0.1]], atol=1e-12)
     assert robot.total_mass == pytest.approx(42.01, abs=1e-9)
-    assert jumper.lumped.changed["left and right evened out, masses"][0] == pytest.approx(0.333, abs=1e-3)
+    assert lumped.changed["left and right evened out, masses"][0] == pytest.approx(0.333, abs=1e-3)
 
 
 def test_differences_of_a_light_body_count_little():
@@ -242,5 +238,6 @@ def test_differences_of_a_light_body_count_little():
     for name, inertia, done in (("left_hip_yaw_link", "1.1e-06", True), ("left_shank", "0.035", False)):
         robot = root()
         link(robot, name).find("inertial/inertia").set("iyy", inertia)
-        changed = make_jumper(text(robot), read_toml(config("x"), "config"), "my.urdf").lumped.changed
+        _, lumped, _ = make_jumper(text(robot), read_toml(config("x"), "config"), "my.urdf")
+        changed = lumped.changed
         assert any("differ, left as they are" in said for said in changed) is not done, (name, changed)

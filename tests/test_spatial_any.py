@@ -174,8 +174,7 @@ def test_what_moves_besides_and_how_it_rests_is_told():
         "[feet]", 'free = ["left_shoulder_pitch", "right_shoulder_pitch"]\n[feet]'
     )
     rest = "[rest]\nleft_shoulder_pitch = -0.3\nright_shoulder_pitch = -0.3\n"
-    jumper = make_jumper(text(root()), read_toml(toml + rest, "config"), "my.urdf")
-    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    robot, _, _ = make_jumper(text(root()), read_toml(toml + rest, "config"), "my.urdf")
     assert len(robot.joint_names) == 14 and not robot.planar and dict(robot.rest)["left_shoulder_pitch"] == -0.3
     assert stance_configuration(robot)[[13, 20]] == pytest.approx([-0.3, -0.3])
     with pytest.raises(

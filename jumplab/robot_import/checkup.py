@@ -14,9 +14,10 @@ from jumplab.robot.description import Robot
 from jumplab.robot.files import files_of, read_toml, roles_table
 from jumplab.robot.stance import check_stance, stance_configuration
 from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.jumper import REPAIRS, Jumper, make_jumper
+from jumplab.robot_import.jumper import REPAIRS, make_jumper
+from jumplab.robot_import.lump import Lumped
 from jumplab.robot_import.roles import Draft, draft
-from jumplab.robot_import.urdf import MOVING, locate, parse, read_urdf
+from jumplab.robot_import.urdf import MOVING, Tree, locate, parse, read_urdf
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class Checkup:
     """A robot that can be planned with, and how it came about."""
 
     robot: Robot
-    jumper: Jumper  # its lumped bodies and the URDF as it was
+    lumped: Lumped  # its bodies
+    tree: Tree  # the URDF as it was
 
     def rows(self) -> list[dict]:
         """One row per role: joints, direction of their axes, range, torque and speed."""
@@ -45,14 +47,13 @@ class Checkup:
     def lines(self) -> list[str]:
         """What else is worth knowing, a line each."""
         r = self.robot
-        tree = self.jumper.tree
         moving = len(r.joint_names)
         foot = r.foot
         com = pin.centerOfMass(r.model, r.model.createData(), stance_configuration(r))
-        movable = sum(joint.kind in MOVING for joint in tree.joints.values())
+        movable = sum(joint.kind in MOVING for joint in self.tree.joints.values())
         out = [
-            f"robot {r.name}: {r.total_mass:.3f} kg ({tree.mass:.3f} kg in the XML), {moving} of "
-            f"{movable} joints move, {len(self.jumper.lumped.held)} are held off zero",
+            f"robot {r.name}: {r.total_mass:.3f} kg ({self.tree.mass:.3f} kg in the XML), {moving} of "
+            f"{movable} joints move, {len(self.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
             f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
             f"standing: CoM {com[2]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "
@@ -62,8 +63,7 @@ class Checkup:
             else "no five links describe it: jumps are planned directly, not in three steps",
         ]
         return out + [
-            f"changed: {what}: {x:.3g} {unit}"
-            for what, (x, unit) in self.jumper.lumped.changed.items()
+            f"changed: {what}: {x:.3g} {unit}" for what, (x, unit) in self.lumped.changed.items()
         ]
 
 
@@ -98,10 +98,10 @@ def check(path: str | Path, config_text: str, text: str | None = None) -> Checku
     if "source" not in config:
         missing = "the table [source] is missing: it names trunk, forward, up and repair"
         raise RobotError(f"robot configuration: {missing}")
-    jumper = make_jumper(read_urdf(path) if text is None else text, config, path.name, path)
-    robot = Robot(jumper.urdf, jumper.config_text)
-    check_stance(robot)
-    return Checkup(robot, jumper)
+    text = read_urdf(path) if text is None else text
+    result = Checkup(*make_jumper(text, config, path.name, path))
+    check_stance(result.robot)
+    return result
 
 
 def check_texts(urdf: str, config_text: str, where: str) -> None:

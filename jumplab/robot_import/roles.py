@@ -111,12 +111,12 @@ class _Finder:
 
         def counts(j: Joint) -> bool:
             axis = j.kind == "fixed" and j.element.find("axis") is not None
-            return j.driven or (every_kind and (j.kind in (*MOVING, "planar") or axis))
+            return j.driven or (every_kind and (axis or j.kind in (*MOVING, "planar")))
 
         carrying = {joint.parent for joint in self.tree.joints.values()}
         ends = [link for link in self.tree.elements if link not in carrying]
-        chains = [[j for j in self.tree.chain(link) if counts(j)] for link in ends]
-        return [chain for chain in chains if chain]
+        chains = ([*filter(counts, self.tree.chain(link))] for link in ends)
+        return [*filter(None, chains)]
 
     def limbs(self) -> list[tuple[Chain, Chain]]:
         """Pairs of chains whose tips mirror each other across the plane between the hips, on the
@@ -305,11 +305,10 @@ def find_roles(tree: Tree) -> Roles:
         for role, pair in zip(ROLES, pairs, strict=True)
     }
     feet = tuple(finder.foot(*leg) for leg in finder.legs)[order]
-    toes = [j.name for foot in feet for j in tree.joints.values() if j.driven and tree.on(j, foot)]
-    if toes:
-        named = listed(map(repr, toes))
+    below = {link for foot in feet for link in tree.below(foot)}
+    if toes := [j.name for j in tree.joints.values() if j.driven and j.parent in below]:
         notes.append(
-            f"the joints {named} beyond the ankles are held, their links belong to the sole"
+            f"the joints {listed(toes)} beyond the ankles are held, their links belong to the sole"
         )
     if (reach := finder.ahead(forward)) < -BACKWARD_M:
         notes.append(
@@ -465,7 +464,7 @@ def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = Non
         and f"\n# NEEDED: take away the # and put in the numbers [N m, rad/s, rad]\n{asked}",
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
-    roles = replace(roles, notes=(*notes(tree), *tree.notes, *roles.notes))
+    roles = replace(roles, notes=(*notes(tree), *dict.fromkeys(tree.notes), *roles.notes))
     return Draft(config, roles, sole, tuple(faults))
 
 
