@@ -210,6 +210,9 @@ REFUSED = [
     (GOOD, config("x").replace('["left_knee", "right_knee"]', '["right_knee", "left_knee"]'),
      "my.urdf: the role joint 'right_knee' is not between 'trunk' and the foot 'left_foot'; correct [joints], [feet] "
      "links or their order left, right"),
+    (GOOD, config("x").replace('"right_knee"]', '"right_hip_yaw"]'),
+     "my.urdf: between 'trunk' and 'right_foot' come right_hip_yaw, right_hip_pitch, right_ankle_pitch; hip, knee and "
+     "ankle must follow in this order; correct [joints]"),
     (GOOD, config("x").replace('knee = ["left_knee"', 'knee = ["left_hip_yaw"'),
      "my.urdf: between 'trunk' and 'left_foot' come left_hip_yaw, left_hip_pitch, left_ankle_pitch; hip, knee and "
      "ankle must follow in this order; correct [joints]"),

@@ -206,17 +206,13 @@ def with_base(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
     """What trainers in Isaac Lab keep of a motion: joints breadth-first, by name, and the base,
     (F, 3) and quaternion (F, 4) w x y z, velocities in world axes at its origin; 32-bit floats.
     """
-    base, turn, speed, spin = whole.bodies(x, whole.links[:1], at_com=False).values()
     arrays = tracked(whole, x, fps, order=ORDERS[1])
-    kept = {k: arrays[k] for k in ("fps", "joint_pos", "joint_vel", "joint_torque")}
-    places = {"base_pos_w": base, "base_quat_w": turn}
-    places |= {"base_lin_vel_w": speed, "base_ang_vel_w": spin}
-    return {
-        "framerate": np.array(float(fps)),
-        **kept,
-        **{name: array[:, 0].astype(np.float32) for name, array in places.items()},
-        **{k: arrays[k] for k in ("contact", "phase", "joint_names")},
-    }
+    arrays.pop("body_names")
+    out = {"framerate": np.array(float(fps))}
+    for name, array in arrays.items():
+        body = name.startswith("body_")
+        out[name.replace("body_", "base_")] = array[:, 0] if body else array
+    return out
 
 
 def library_entry(

@@ -190,14 +190,11 @@ def entry(
             raise RobotError(f"robot configuration: the entry {where!r} is missing")
         value = value[key]
     items = value if count else [value]
-    numbers = kind is float
+    types, wanted = ((int, float), "a finite number") if kind is float else ((str,), "a text")
     good = isinstance(items, list) and len(items) == (count or 1)
-    good = good and all(
-        isinstance(x, (int, float) if numbers else str) and not isinstance(x, bool) for x in items
-    )
-    if not good or (numbers and not np.all(np.isfinite(items))):
+    good = good and all(type(x) in types for x in items)
+    if not good or (kind is float and not np.all(np.isfinite(items))):
         many = f"{count} of " if count else ""
-        wanted = "a finite number" if numbers else "a text"
         raise RobotError(f"robot configuration: {where!r} = {value!r}, must be {many}{wanted}")
     clean = [kind(x) for x in items]
     return clean if count else clean[0]

@@ -52,8 +52,8 @@ class Checkup:
         com = pin.centerOfMass(r.model, r.model.createData(), stance_configuration(r))
         movable = sum(joint.kind in MOVING for joint in self.tree.joints.values())
         out = [
-            f"robot {r.name}: {r.total_mass:.3f} kg ({self.tree.mass:.3f} kg in the XML), {moving} of "
-            f"{movable} joints move, {len(self.lumped.held)} are held off zero",
+            f"robot {r.name}: {r.total_mass:.3f} kg ({self.tree.mass:.3f} kg in the XML), "
+            f"{moving} of {movable} joints move, {len(self.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
             f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
             f"standing: CoM {com[2]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "

@@ -24,7 +24,7 @@ from jumplab.robot.files import LEG, TABLES, check_entries, entry, roles_table, 
 from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
-from jumplab.robot_import.urdf import LIMITS, MOVING, OWN, Tree
+from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
 from jumplab.robot_import.write import (
     HERE,
     add_boxes,

@@ -61,10 +61,13 @@ def as_description(path: Path, text: str) -> str:
 # reading
 # --------------------------------------------------------------------------------------------------
 def _spec(path: Path, text: str) -> mujoco.MjSpec:
-    """MuJoCo's own reading of a file, whatever it is called: of itself it reads .xml alone."""
+    """MuJoCo's own reading of a file, whatever it is called."""
     # MuJoCo would write its warnings into a file of the working folder
     mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
     try:
+        # MuJoCo reads only files that are called so; what they include may lie in other folders
+        if path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64]):
+            return mujoco.MjSpec.from_file(str(path))
         included = {name: inner.encode() for name, inner in _included(path.parent, text)}
         spec = mujoco.MjSpec.from_string(text, include=included)
         spec.modelfiledir = f"{path.parent}/"
