@@ -11,7 +11,7 @@ import pinocchio as pin
 from jumplab.errors import InputError, RobotError
 from jumplab.io.motion import Motion, steady
 from jumplab.robot import Robot
-from jumplab.robot.files import entry, read_toml, table
+from jumplab.robot.files import entry, numbers, read_toml
 
 ORDERS = ("depth-first", "breadth-first")  # of links and joints: MuJoCo's and Isaac Lab's
 # [m] joints of both robots may be apart: twice what left and right are evened out by at most
@@ -44,11 +44,10 @@ class Whole:
                 f"robot {robot.name}: [published] holds no URDF: {str(e).splitlines()[0]}"
             ) from e
         self.model.gravity.linear = np.array([0.0, 0.0, -robot.gravity])
-        held = table(table(config, "published"), "held")
-        self._held = {name: entry(config, "published", "held", name) for name in held}
+        self._held = numbers(config, "published", "held")
         trunk = entry(config, "published", "trunk", kind=str, default=self.links[0])
         self._trunk = self._frame(trunk)
-        for name in (*robot.joint_names, *held):
+        for name in (*robot.joint_names, *self._held):
             if name not in self.joints:
                 raise RobotError(f"robot {robot.name}: [published] lacks the joint {name!r}")
         self._order = self._columns(self.joints)

@@ -19,8 +19,17 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot.description import STANCE, Robot
-from jumplab.robot.files import LEG, TABLES, check_entries, entry, roles_table, table
+from jumplab.robot.description import Robot
+from jumplab.robot.files import (
+    LEG,
+    STANCE,
+    TABLES,
+    check_entries,
+    entry,
+    numbers,
+    roles_table,
+    table,
+)
 from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
@@ -383,7 +392,7 @@ def _trunk_boxes(config: dict, leg: float, hip: np.ndarray) -> Boxes:
 def _toml(
     config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], urdf: str, lumped: Lumped
 ) -> str:
-    rest = {name: entry(config, "rest", name) for name in table(config, "rest")}
+    rest = numbers(config, "rest")
     if unknown := sorted(rest.keys() - {b.joint for b in lumped.bodies.values()}):
         raise RobotError(
             f"robot configuration: [rest] names the joint {unknown[0]!r}, which does not move"
