@@ -29,6 +29,7 @@ from jumplab.auditing.audit import audit
 from jumplab.robot import Robot
 from jumplab.robot.files import read_toml
 from jumplab.robot.stance import stance_angles
+from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.sim import INSTALLED, Scene, engine_class, simulate_jump
 from jumplab.stages.planner import Planner
@@ -40,7 +41,7 @@ def load(folder, variant, *args) -> Robot:
 
 
 def made(urdf: str, toml: str) -> Robot:
-    return make_jumper(urdf, read_toml(toml, "config"), "my.urdf")[0]
+    return make_jumper(read_tree(urdf, "my.urdf"), read_toml(toml, "config"))[0]
 
 
 # the models -----------------------------------------------------------------------------------------------------
@@ -59,7 +60,7 @@ def test_canted_hips_leave_the_plane(tmp_path):
 
 
 def test_a_robot_whose_sides_differ_is_left_as_it_is():
-    robot, lumped, _ = make_jumper(wider_left(), read_toml(config("x"), "config"), "my.urdf")
+    robot, lumped = make_jumper(read_tree(wider_left(), "my.urdf"), read_toml(config("x"), "config"))
     said = "left and right differ, left as they are, places"
     assert lumped.changed[said][0] == pytest.approx(50.0)
     assert not robot.planar
@@ -227,7 +228,7 @@ def test_what_cannot_be_meant_is_refused(urdf, toml, sentence):
 
 
 def test_small_differences_of_the_sides_are_evened_out():
-    robot, lumped, _ = make_jumper(heavier_left(), read_toml(config("x"), "config"), "my.urdf")
+    robot, lumped = make_jumper(read_tree(heavier_left(), "my.urdf"), read_toml(config("x"), "config"))
     masses = [robot.model.inertias[robot.model.getJointId(f"{side}_knee")].mass for side in ("left", "right")]
     assert masses == pytest.approx([3.005, 3.005], abs=1e-12)
     hips = [robot.model.jointPlacements[robot.model.getJointId(f"{side}_hip_yaw")] for side in ("left", "right")]
@@ -241,6 +242,6 @@ def test_differences_of_a_light_body_count_little():
     for name, inertia, done in (("left_hip_yaw_link", "1.1e-06", True), ("left_shank", "0.035", False)):
         robot = root()
         link(robot, name).find("inertial/inertia").set("iyy", inertia)
-        _, lumped, _ = make_jumper(text(robot), read_toml(config("x"), "config"), "my.urdf")
+        _, lumped = make_jumper(read_tree(text(robot), "my.urdf"), read_toml(config("x"), "config"))
         changed = lumped.changed
         assert any("differ, left as they are" in said for said in changed) is not done, (name, changed)

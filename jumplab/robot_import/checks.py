@@ -70,7 +70,9 @@ def read_tree(
     root = parse(text, where)
     for sentence in faults(root, where, repair):
         raise RobotError(sentence)
-    return Tree(root, where, path, "inertia" in repair)
+    tree = Tree(root, where, path, "inertia" in repair)
+    tree.text = text
+    return tree
 
 
 def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[str]:

@@ -14,7 +14,7 @@ from jumplab.robot.description import Robot
 from jumplab.robot.files import files_of, read_toml, roles_table
 from jumplab.robot.stance import check_stance, stance_configuration
 from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.jumper import REPAIRS, make_jumper
+from jumplab.robot_import.jumper import REPAIRS, make_jumper, source_of
 from jumplab.robot_import.lump import Lumped
 from jumplab.robot_import.roles import Draft, draft
 from jumplab.robot_import.urdf import MOVING, Tree, locate, parse, read_urdf
@@ -67,39 +67,40 @@ class Checkup:
         ]
 
 
-def first_look(
-    path: str | Path, repair: tuple[str, ...] = (), text: str | None = None
-) -> tuple[Draft | None, list[str]]:
+def first_look(path: str | Path, repair: tuple[str, ...] = ()) -> tuple[Draft | None, list[str]]:
     """A first description of a URDF, and every fault of the file, else of the limits of the joints
     with a role.
 
     With faults of the file the roles are those that it has once all repairs are allowed; None if
-    not even then. ``text`` is what :func:`.urdf.read_urdf` has read of it, if it was read before.
-    Raises :class:`RobotError` if it is no URDF at all, or has no two legs.
+    not even then. Raises :class:`RobotError` if it is no URDF at all, or has no two legs.
     """
     path = Path(path)
-    text = read_urdf(path) if text is None else text
-    if not (faults := urdf_checks.faults(parse(text, path.name), path.name, repair)):
-        first = draft(path, repair, text)
-        return first, list(first.faults)
     try:
-        return draft(path, REPAIRS, text), faults
+        first = draft(path, repair)
+        return first, list(first.faults)
+    except RobotError:
+        faults = urdf_checks.faults(parse(read_urdf(path), path.name), path.name, repair)
+        if not faults:
+            raise
+    try:
+        return draft(path, REPAIRS), faults
     except RobotError:
         return None, faults
 
 
-def check(path: str | Path, config_text: str, text: str | None = None) -> Checkup:
+def check(path: str | Path, config_text: str, tree: Tree | None = None) -> Checkup:
     """The robot of a URDF and a configuration with [source]; raises :class:`RobotError`.
 
-    ``text`` as of :func:`first_look`.
+    ``tree`` is that of its :class:`.roles.Draft`, if there is one.
     """
     path = Path(path)
     config = read_toml(config_text, "robot configuration")
     if "source" not in config:
         missing = "the table [source] is missing: it names trunk, forward, up and repair"
         raise RobotError(f"robot configuration: {missing}")
-    text = read_urdf(path) if text is None else text
-    result = Checkup(*make_jumper(text, config, path.name, path))
+    repair = source_of(config)["repair"]
+    tree = tree or urdf_checks.read_tree(read_urdf(path), path.name, path, repair)
+    result = Checkup(*make_jumper(tree, config), tree)
     check_stance(result.robot)
     return result
 
@@ -130,10 +131,10 @@ def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
     """The checkup of a name or a path; roles are found where no table [source] tells them."""
     urdf, folder, config = files_of(robot)
     path = locate(urdf, folder)
-    text = read_urdf(path)
-    if config is None or "source" not in read_toml(config, "robot configuration"):
-        config = draft(path, repair, text).text
-    return check(path, config, text)
+    if config is not None and "source" in read_toml(config, "robot configuration"):
+        return check(path, config)
+    first = draft(path, repair)
+    return check(path, first.text, first.tree)
 
 
 def load(name_or_path: str | Path, repair: tuple[str, ...] = ()) -> Robot:

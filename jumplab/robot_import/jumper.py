@@ -11,7 +11,6 @@ import copy
 import hashlib
 from collections.abc import Sequence
 from itertools import product
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import coal
@@ -30,7 +29,6 @@ from jumplab.robot.files import (
     roles_table,
     table,
 )
-from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
 from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
@@ -72,32 +70,30 @@ ANY = {"lower": -np.pi, "upper": np.pi, "effort": 0.0, "velocity": 0.0}
 Boxes = list[tuple[np.ndarray, np.ndarray]]  # (centre, size) in the frame of a body [m]
 
 
-def make_jumper(
-    urdf: str, config: dict, where: str, path: Path | None = None
-) -> tuple[Robot, Lumped, Tree]:
-    """Check, lump and rewrite: a robot that every stage can read, its bodies, and the URDF as it
-    was; raises :class:`RobotError`.
+def make_jumper(tree: Tree, config: dict) -> tuple[Robot, Lumped]:
+    """Lump and rewrite: a robot that every stage can read, and its bodies; raises
+    :class:`RobotError`.
 
-    ``urdf`` is a text and ``config`` a configuration with a table [source]; ``where`` names the
-    URDF in messages, and meshes are looked for near its ``path``.
+    ``tree`` is that of a URDF, and ``config`` a configuration with a table [source].
     """
     check_entries(config, SOURCE_TABLES)
     config = _facing(config)
-    source = _source(config)
-    tree = read_tree(urdf, where, path, source["repair"])
+    source = source_of(config)
     roles = roles_table(config)
     feet = tuple(entry(config, "feet", "links", kind=str, count=2))
     lumped = lump(tree, config, roles, source, feet)
-    sole = _sole(config, lumped.place(feet[0]).translation, where)
+    sole = _sole(tree, config, lumped.place(feet[0]).translation)
     boxes = _boxes(config, roles, lumped, sole)
     _cut_hips(lumped, roles, boxes)
     text = _urdf(entry(config, "name", kind=str), lumped, roles, boxes)
-    config_text = _toml(config, roles, feet, sole, urdf, lumped) + _published(tree, lumped, boxes)
-    return Robot(text, config_text), lumped, tree
+    config_text = _toml(config, roles, feet, sole, tree.text, lumped) + _published(
+        tree, lumped, boxes
+    )
+    return Robot(text, config_text), lumped
 
 
-def _source(config: dict) -> dict:
-    """trunk, forward, up, repair of [source]."""
+def source_of(config: dict) -> dict:
+    """trunk, forward, up, repair of [source]; raises :class:`RobotError`."""
     out = {"trunk": entry(config, "source", "trunk", kind=str)}
     for key, default in (("forward", "+x"), ("up", "+z")):
         out[key] = entry(config, "source", key, kind=str, default=default)
@@ -149,7 +145,7 @@ def _facing(config: dict) -> dict:
     return new
 
 
-def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
+def _sole(tree: Tree, config: dict, offset: np.ndarray) -> dict[str, float]:
     """The sole in the frame of the foot body, whose link is ``offset`` (3,) [m] from it."""
     ahead, left, up = offset
     x = np.array(entry(config, "feet", "sole_x_m", count=2)) + ahead
@@ -157,8 +153,8 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     z = entry(config, "feet", "sole_z_m") + up
     half = (y[1] - y[0]) / 2 - abs(y[0] + y[1]) / 2  # the part that is symmetric about the ankle
     if not (x[0] < 0.0 < x[1] and half > 0 and z < 0):
-        raise RobotError(
-            f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
+        raise tree.error(
+            f"the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
             f"must lie below it and reach to both sides of it: the foot stands on its heel or its "
             f"toes with all joints at 0, or [feet] is wrong; give there the sole along the level "
             f"axes"

@@ -407,7 +407,8 @@ def _explain(tree: Tree) -> NoReturn:
 # ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Draft:
-    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found.
+    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found
+    in its ``tree``.
 
     ``faults`` are those of the limits of the joints that were found, one sentence each.
     """
@@ -415,18 +416,18 @@ class Draft:
     text: str
     roles: Roles
     sole: Sole
+    tree: Tree
     faults: tuple[str, ...]
 
 
-def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = None) -> Draft:
+def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     """Find the roles in a URDF and write the first TOML file for it, from ``starter.toml.in``;
     numbers that it lacks are asked for in comments. Raises :class:`RobotError`.
 
-    ``repair`` is what the person allows to be repaired, ``text`` what :func:`.urdf.read_urdf` has
-    read of the file, if it was read before.
+    ``repair`` is what the person allows to be repaired.
     """
     path = Path(path)
-    tree = read_tree(read_urdf(path) if text is None else text, path.name, path, repair)
+    tree = read_tree(read_urdf(path), path.name, path, repair)
     roles = find_roles(tree)
     turn = robot_axes(tree.pose[roles.trunk].rotation, roles.forward, roles.up)
     hip, _, ankle = (tree.pose[tree.joints[roles.joints[r][0]].child].translation for r in LEG)
@@ -467,7 +468,7 @@ def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = Non
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
     roles = replace(roles, notes=(*notes(tree), *dict.fromkeys(tree.notes), *roles.notes))
-    return Draft(config, roles, sole, tuple(faults))
+    return Draft(config, roles, sole, tree, tuple(faults))
 
 
 def jumping_joints(tree: Tree, roles: Roles) -> list[str]:

@@ -315,6 +315,7 @@ class Tree:
         self, root: ET.Element, where: str, path: Path | None = None, repair_inertia: bool = False
     ):
         self.xml = root
+        self.text = ""
         self.format = root.get("format", "URDF")
         self.where = where
         self.notes = []  # on files that were read on the way
