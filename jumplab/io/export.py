@@ -316,17 +316,12 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     for name in whole.joints:
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         joint = spec.joint(name)
-        if name in whole.robot.actuators:
-            effort = whole.robot.actuators[name]["effort"]
-            joint.actfrcrange = [-effort, effort]
+        if own := whole.robot.actuators.get(name):
+            joint.actfrcrange = [-own["effort"], own["effort"]]
+            joint.armature = own["armature"]
+            joint.frictionloss = own["friction"]
+            joint.damping = [own["damping"], 0.0, 0.0]  # of a polynomial in the rate
         motor.ctrlrange = joint.actfrcrange
-    motors = whole.robot.motors
-    for name, value in motors["armature"].items():
-        spec.joint(name).armature = value
-    for name, value in motors["friction"].items():
-        spec.joint(name).frictionloss = value
-    for name, value in motors["damping"].items():
-        spec.joint(name).damping = [value, 0.0, 0.0]  # of a polynomial in the rate
     spec.compile()
     qpos, qvel = _qpos_qvel(x)
     arrays = {

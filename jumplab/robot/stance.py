@@ -276,7 +276,7 @@ def holding(robot: Robot, q: np.ndarray, friction: float) -> tuple[float, str, f
     pin.computeJointJacobians(model, data, q)
     level = friction / np.sqrt(2)
     edges = np.array([[x, y, 1.0] for x in (-level, level) for y in (-level, level)])
-    anchors = [anchor for corner in robot.foot.corners for anchor in on_feet(robot, corner)]
+    anchors = [on_feet(robot, corner)[side] for side in (0, 1) for corner in robot.foot.corners]
     slopes = [pin.getFrameJacobian(model, data, a.joint, a.placement, WORLD)[:3] for a in anchors]
     pushed = np.concatenate([edges @ slope for slope in slopes]).T
     effort = robot.limits.effort

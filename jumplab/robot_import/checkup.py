@@ -19,6 +19,8 @@ from jumplab.robot_import.lump import Lumped
 from jumplab.robot_import.roles import Draft, draft
 from jumplab.robot_import.urdf import MOVING, Tree, locate, parse, read_urdf
 
+COLUMNS = ("role", "left", "right", "axes", "range", "N m", "rad/s")
+
 
 @dataclass(frozen=True)
 class Checkup:
@@ -33,15 +35,16 @@ class Checkup:
         s = self.robot.sagittal
         out = []
         for i, (role, pair) in enumerate(self.robot.joints.items()):
-            row = dict.fromkeys(("role", "left", "right", "axes", "range", "N m", "rad/s"), "")
-            row |= {"role": role.replace("_", " "), "left": "held", "right": "held"}
+            values = ("held", "held", "", "", "", "")
             if pair:
-                row["left"], row["right"] = pair
-                row["axes"] = " ".join("+y" if x > 0 else "-y" for x in s.signs[i])
-                row["range"] = f"{s.lower[i]:+.2f} ... {s.upper[i]:+.2f}"
-                row["N m"] = f"{s.effort[i] / 2:.4g}"
-                row["rad/s"] = f"{s.speed[i]:.4g}"
-            out.append(row)
+                values = (
+                    *pair,
+                    " ".join("+y" if x > 0 else "-y" for x in s.signs[i]),
+                    f"{s.lower[i]:+.2f} ... {s.upper[i]:+.2f}",
+                    f"{s.effort[i] / 2:.4g}",
+                    f"{s.speed[i]:.4g}",
+                )
+            out.append(dict(zip(COLUMNS, (role.replace("_", " "), *values), strict=True)))
         return out
 
     def lines(self) -> list[str]:
@@ -51,7 +54,7 @@ class Checkup:
         foot = r.foot
         com = pin.centerOfMass(r.model, r.model.createData(), stance_configuration(r))
         movable = sum(joint.kind in MOVING for joint in self.tree.joints.values())
-        out = [
+        return [
             f"robot {r.name}: {r.total_mass:.3f} kg ({self.tree.mass:.3f} kg in the XML), "
             f"{moving} of {movable} joints move, {len(self.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
@@ -61,9 +64,7 @@ class Checkup:
             "five links describe it"
             if r.planar
             else "no five links describe it: jumps are planned directly, not in three steps",
-        ]
-        return out + [
-            f"changed: {what}: {x:.3g} {unit}" for what, (x, unit) in self.lumped.changed.items()
+            *(f"changed: {k}: {x:.3g} {unit}" for k, (x, unit) in self.lumped.changed.items()),
         ]
 
 
