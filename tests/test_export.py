@@ -314,9 +314,8 @@ def test_tables_that_make_no_robot(tmp_path, old, new, sentence):
 def test_replay_by_the_script_of_its_readme(flip, bhr, odd_folder, monkeypatch):
     pybullet = pytest.importorskip("pybullet")
     folder = export.write("urdf-replay", flip, bhr, odd_folder / "replay")
-    assert names(folder) == ["README.md", "replay.py", "robot.urdf", "trajectory.npz"]
-    script = re.search(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.S)[1]
-    assert script == (folder / "replay.py").read_text() and len(script.splitlines()) <= 10
+    script = (folder / "replay.py").read_text()
+    assert len(script.splitlines()) <= 10
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["replay.py", "--no-window"])
     space = {}
@@ -351,14 +350,11 @@ def plan(tmp_path_factory):
 
 def test_command(capsys, plan, tmp_path):
     duration = store.read_plan(plan)[0].t[-1]
-    for format_name, (name, _) in export.FORMATS.items():
-        out = tmp_path / "new" / name
+    for format_name in ("asap-pkl", "mujoco"):  # a file, and a folder
+        out = tmp_path / "new" / export.FORMATS[format_name][0]
         code, said, err = run(capsys, "export", plan, "--format", format_name, "--out", out)
-        assert (
-            (code, err) == (0, "")
-            and said == f"plan to touchdown, {duration:.3f} s, as {format_name}: {out}\n"
-            and out.exists()
-        )
+        assert (code, err) == (0, "") and out.exists()
+        assert said == f"plan to touchdown, {duration:.3f} s, as {format_name}: {out}\n"
     code, said, err = run(capsys, "export", plan, "--format", "csv", "--simulated")
     assert (code, err) == (0, "") and said.startswith("simulation, 0.029 s, as csv: ")
     table = np.genfromtxt(plan / "simulated_joints.csv", delimiter=",", names=True)
@@ -370,14 +366,7 @@ def test_command(capsys, plan, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--format", "csv", "--out", "x.txt"], "--out must name a file that ends in .csv, got 'x.txt'"),
         (["--format", "mjlab-npz", "--fps", "many"], "--fps must be a number, got 'many'"),
-        (["--format", "mujoco", "--out", "mine"],
-         "the folder 'mine' already holds 'thesis.tex'; choose a new or an empty one"),
-        (["--format", "mjlab-npz", "--fps", "0", "--out", "x.npz"],
-         "rate = 0 per second must lie above 0 and not above 10000"),
-        (["--format", "npz", "--out", "/dev/null/x.npz"],
-         "'/dev/null' is a file; choose a folder"),
         (["--format", "urdf-replay", "--out", "mine"],
          "the folder 'mine' already holds 'thesis.tex'; choose a new or an empty one"),
         (["--format", "urdf-replay", "--out", "mine/thesis.tex"], "'mine/thesis.tex' is a file; choose a folder"),

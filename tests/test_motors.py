@@ -22,6 +22,7 @@ from jumplab.robot.files import read_toml
 from jumplab.robot.motors import SLIDING_RATE
 from jumplab.robot.sagittal import JOINT_OF_ANGLES
 from jumplab.robot.stance import stance_configuration
+from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.sim import INSTALLED, STEP_S, simulate_jump
 from jumplab.sim.checks import check
@@ -66,8 +67,7 @@ def plan(heavy):
 
 # told ---------------------------------------------------------------------------------------------------------------
 def imported(told: str) -> Robot:
-    jumper = make_jumper(text(root()), read_toml(config("x") + told, "config"), "my.urdf")
-    return Robot.from_text(jumper.urdf, jumper.config_text)
+    return make_jumper(read_tree(text(root()), "my.urdf"), read_toml(config("x") + told, "config"))[0]
 
 
 def test_read_for_a_role_and_for_one_of_its_joints():

@@ -29,6 +29,7 @@ from jumplab.auditing.audit import audit
 from jumplab.robot import Robot
 from jumplab.robot.files import read_toml
 from jumplab.robot.stance import stance_angles
+from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.sim import INSTALLED, Scene, engine_class, simulate_jump
 from jumplab.stages.planner import Planner
@@ -40,8 +41,7 @@ def load(folder, variant, *args) -> Robot:
 
 
 def made(urdf: str, toml: str) -> Robot:
-    jumper = make_jumper(urdf, read_toml(toml, "config"), "my.urdf")
-    return Robot.from_text(jumper.urdf, jumper.config_text)
+    return make_jumper(read_tree(urdf, "my.urdf"), read_toml(toml, "config"))[0]
 
 
 # the models -----------------------------------------------------------------------------------------------------
@@ -60,10 +60,9 @@ def test_canted_hips_leave_the_plane(tmp_path):
 
 
 def test_a_robot_whose_sides_differ_is_left_as_it_is():
-    jumper = make_jumper(wider_left(), read_toml(config("x"), "config"), "my.urdf")
-    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    robot, lumped = make_jumper(read_tree(wider_left(), "my.urdf"), read_toml(config("x"), "config"))
     said = "left and right differ, left as they are, places"
-    assert jumper.lumped.changed[said][0] == pytest.approx(50.0)
+    assert lumped.changed[said][0] == pytest.approx(50.0)
     assert not robot.planar
 
 
@@ -212,6 +211,9 @@ REFUSED = [
     (GOOD, config("x").replace('["left_knee", "right_knee"]', '["right_knee", "left_knee"]'),
      "my.urdf: the role joint 'right_knee' is not between 'trunk' and the foot 'left_foot'; correct [joints], [feet] "
      "links or their order left, right"),
+    (GOOD, config("x").replace('"right_knee"]', '"right_hip_yaw"]'),
+     "my.urdf: between 'trunk' and 'right_foot' come right_hip_yaw, right_hip_pitch, right_ankle_pitch; hip, knee and "
+     "ankle must follow in this order; correct [joints]"),
     (GOOD, config("x").replace('knee = ["left_knee"', 'knee = ["left_hip_yaw"'),
      "my.urdf: between 'trunk' and 'left_foot' come left_hip_yaw, left_hip_pitch, left_ankle_pitch; hip, knee and "
      "ankle must follow in this order; correct [joints]"),
@@ -226,15 +228,13 @@ def test_what_cannot_be_meant_is_refused(urdf, toml, sentence):
 
 
 def test_small_differences_of_the_sides_are_evened_out():
-    toml = read_toml(config("x"), "config")
-    jumper = make_jumper(heavier_left(), toml, "my.urdf")
-    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    robot, lumped = make_jumper(read_tree(heavier_left(), "my.urdf"), read_toml(config("x"), "config"))
     masses = [robot.model.inertias[robot.model.getJointId(f"{side}_knee")].mass for side in ("left", "right")]
     assert masses == pytest.approx([3.005, 3.005], abs=1e-12)
     hips = [robot.model.jointPlacements[robot.model.getJointId(f"{side}_hip_yaw")] for side in ("left", "right")]
     np.testing.assert_allclose([hip.translation[:2] for hip in hips], [[0.001, 0.1], [0.001, -0.1]], atol=1e-12)
     assert robot.total_mass == pytest.approx(42.01, abs=1e-9)
-    assert jumper.lumped.changed["left and right evened out, masses"][0] == pytest.approx(0.333, abs=1e-3)
+    assert lumped.changed["left and right evened out, masses"][0] == pytest.approx(0.333, abs=1e-3)
 
 
 def test_differences_of_a_light_body_count_little():
@@ -242,5 +242,6 @@ def test_differences_of_a_light_body_count_little():
     for name, inertia, done in (("left_hip_yaw_link", "1.1e-06", True), ("left_shank", "0.035", False)):
         robot = root()
         link(robot, name).find("inertial/inertia").set("iyy", inertia)
-        changed = make_jumper(text(robot), read_toml(config("x"), "config"), "my.urdf").lumped.changed
+        _, lumped = make_jumper(read_tree(text(robot), "my.urdf"), read_toml(config("x"), "config"))
+        changed = lumped.changed
         assert any("differ, left as they are" in said for said in changed) is not done, (name, changed)

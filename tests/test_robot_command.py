@@ -4,7 +4,8 @@ import sys
 from types import ModuleType
 
 import pytest
-from fixtures_robots import GOOD, config, mirrored, write
+from fixtures_robots import GOOD, config, held_arms, mirrored, write
+from matplotlib.figure import Figure
 
 from jumplab.cli.main import main
 from jumplab.robot import Robot
@@ -17,7 +18,7 @@ def quoted(capsys, *argv) -> tuple[int, str, str]:
     return code, out, err
 
 
-def test_check_finds_draws_and_writes_what_can_be_loaded(capsys, tmp_path):
+def test_check_finds_draws_and_writes_what_can_be_loaded(capsys, tmp_path, monkeypatch):
     (tmp_path / "my.urdf").write_text(mirrored()[0])
     code, out, err = quoted(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
     assert (code, err) == (0, "")
@@ -26,6 +27,7 @@ def test_check_finds_draws_and_writes_what_can_be_loaded(capsys, tmp_path):
     assert (tmp_path / "out" / "bhr.png").stat().st_size > 10_000
     robot = Robot.load(str(tmp_path / "out" / "bhr.toml"))
     assert robot.joints["knee"] == ("left_knee", "right_knee")
+    monkeypatch.setattr("jumplab.show.bodies.robot_sheet", lambda robot: Figure())  # drawn before
     again = ("check", tmp_path / "my.urdf", "--out", tmp_path / "out")
     assert quoted(capsys, *again)[0] == 0  # unedited, it is written anew
     toml = tmp_path / "out" / "bhr.toml"
@@ -125,8 +127,6 @@ def test_a_configuration_without_source_is_refused(capsys, tmp_path):
 
 
 def test_sheet_of_a_robot_with_and_without_arms(bhr, tmp_path):
-    from fixtures_robots import held_arms
-
     for robot in (bhr, Robot.load(write(tmp_path, held_arms))):
         texts = [t.get_text() for ax in robot_sheet(robot).axes for t in ax.texts]
         assert ("arms held" in texts) == (not robot.joints["shoulder_pitch"])

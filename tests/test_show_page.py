@@ -192,7 +192,7 @@ def test_meshes_of_a_published_robot_lie_where_its_urdf_puts_them(name):
     model = pin.buildModelFromUrdf(str(path))
     geometry = pin.buildGeomFromUrdf(model, str(path), pin.GeometryType.VISUAL, package_dirs=str(share))
     q, data, places = pin.neutral(model), model.createData(), geometry.createData()
-    for joint, angle in examine(name).jumper.lumped.held.items():
+    for joint, angle in examine(name).lumped.held.items():
         if model.existJointName(joint):
             q[model.idx_qs[model.getJointId(joint)]] = angle
     pin.updateGeometryPlacements(model, data, geometry, places, q)

@@ -14,6 +14,7 @@ from jumplab.robot import Robot
 from jumplab.robot.files import read_toml
 from jumplab.robot.reduction import mirror
 from jumplab.robot.stance import holding, knees, stance_configuration
+from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.robot_import.roles import draft
 from jumplab.sim import simulate_jump
@@ -174,14 +175,13 @@ def test_what_moves_besides_and_how_it_rests_is_told():
         "[feet]", 'free = ["left_shoulder_pitch", "right_shoulder_pitch"]\n[feet]'
     )
     rest = "[rest]\nleft_shoulder_pitch = -0.3\nright_shoulder_pitch = -0.3\n"
-    jumper = make_jumper(text(root()), read_toml(toml + rest, "config"), "my.urdf")
-    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    robot, _ = make_jumper(read_tree(text(root()), "my.urdf"), read_toml(toml + rest, "config"))
     assert len(robot.joint_names) == 14 and not robot.planar and dict(robot.rest)["left_shoulder_pitch"] == -0.3
     assert stance_configuration(robot)[[13, 20]] == pytest.approx([-0.3, -0.3])
     with pytest.raises(
         RobotError, match=r"^robot configuration: \[rest\] names the joint 'neck', which does not move$"
     ):
-        make_jumper(text(root()), read_toml(toml + "[rest]\nneck = 0.1\n", "config"), "my.urdf")
+        make_jumper(read_tree(text(root()), "my.urdf"), read_toml(toml + "[rest]\nneck = 0.1\n", "config"))
 
 
 @pytest.mark.parametrize("cant_rad", [0.1, 0.44, 0.79])

@@ -1,11 +1,17 @@
 """The command ``jumplab robot``: which robots there are, and whether a URDF is one."""
 
+from __future__ import annotations
+
 import hashlib
 from argparse import Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jumplab.cli.common import Late, robots, store, style, tables
 from jumplab.errors import InputError, JumplabError, RobotError
+
+if TYPE_CHECKING:  # help of a command is there before NumPy is
+    from jumplab.robot_import.roles import Draft
 
 checkup = Late("robot_import.checkup")
 files = Late("robot.files")
@@ -63,9 +69,8 @@ def check(args: Namespace) -> None:
             ) from e
         result = checkup.check(urdf, text)
     elif not shipped:
-        whole = urdfs.read_urdf(urdf)
-        config = _draft(urdf, whole, tuple(args.repair), args.out, args.force)
-        result = checkup.check(urdf, config, whole)
+        draft = _draft(urdf, tuple(args.repair), args.out, args.force)
+        result = checkup.check(urdf, draft.text, draft.tree)
     elif "[source]" in shipped.read_text(encoding="utf-8"):
         result = checkup.examine(urdf)
     else:
@@ -92,13 +97,13 @@ def robot(args: Namespace) -> None:
     )
 
 
-def _draft(urdf: str, text: str, repair: tuple[str, ...], out: str | None, force: bool) -> str:
-    """The starter configuration of a URDF (path, text) without faults; written as OUT/NAME.toml if
-    there is an ``out``.
+def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> Draft:
+    """A URDF (path) without faults and its starter configuration; written as OUT/NAME.toml if there
+    is an ``out``.
 
     Faults of limits alone do not hinder the writing: they are mended there.
     """
-    draft, faults = checkup.first_look(urdf, repair, text)
+    draft, faults = checkup.first_look(urdf, repair)
     path = None
     if draft:
         for note in draft.roles.notes:
@@ -115,7 +120,7 @@ def _draft(urdf: str, text: str, repair: tuple[str, ...], out: str | None, force
             print(f"comments in {path} list the missing data; check again with --config {path}")
         above = f" ({len(others)} further faults are printed above)" if others else ""
         raise RobotError(first + above)
-    return draft.text
+    return draft
 
 
 def _write(folder: Path, text: str, force: bool) -> Path:

@@ -201,48 +201,39 @@ def _of_animation(x: Mapping[str, Any]) -> _Raw:
     )
 
 
-def _of_base(x: Mapping[str, Any]) -> _Raw:
-    words = "base and joints, quaternion w x y z"
-    return _Raw(x["base_pos_w"], _first_wxyz(x["base_quat_w"]), x["joint_pos"], words)
+def _of_arrays(words: str, x: Mapping[str, Any], names: tuple[str, ...]) -> _Raw:
+    """Base, quaternions and joints of three ``names``, or from the columns of the first one."""
+    parts = [x[name] for name in names[:3]]
+    base, turn, joints = parts if len(names) == 3 else np.split(parts[0], [3, 7], axis=1)
+    return _Raw(base, _first_wxyz(turn) if "w x y z" in words else turn, joints, words)
 
 
-def _of_rows(q: np.ndarray, words: str) -> _Raw:
-    return _Raw(q[:, :3], q[:, 3:7], q[:, 7:], f"{words}, quaternion x y z w")
+# names that a file has to have -> how it is read, or in words what its arrays are; the first that
+# fits counts
+FORMS: Mapping[tuple[str, ...], Callable[[Mapping[str, Any]], _Raw] | str] = {
+    ("root_trans_offset", "root_rot", "dof"): "pickle of a motion library, quaternion x y z w",
+    ("root_pos", "root_rot", "dof_pos"): "pickle of a retargeter, quaternion x y z w",
+    (
+        "base_position_m",
+        "base_quaternion_xyzw",
+        "joint_position_rad",
+    ): "arrays with units, quaternion x y z w",
+    ("body_pos_w", "body_quat_w", "joint_pos"): _of_tracker,
+    ("base_pos_w", "base_quat_w", "joint_pos"): "base and joints, quaternion w x y z",
+    ("root_translateX", "root_rotateX"): _of_animation,
+    ("qpos",): "MuJoCo's qpos, quaternion w x y z",
+    ("q", "joint_names"): "a plan or simulation, quaternion x y z w",
+    ("rows",): "rows of numbers, quaternion x y z w",
+    ("base_x_m", "base_qw"): _of_table,
+}
 
 
-def _of_mujoco(x: Mapping[str, Any]) -> _Raw:
-    q = x["qpos"]
-    return _Raw(q[:, :3], _first_wxyz(q[:, 3:7]), q[:, 7:], "MuJoCo's qpos, quaternion w x y z")
-
-
-def _named(words: str, *names: str) -> Callable[[Mapping[str, Any]], _Raw]:
-    return lambda x: _Raw(*(x[name] for name in names), f"{words}, quaternion x y z w")
-
-
-# names that a file has to have -> how it is read; the first that fits counts
-FORMS: tuple[tuple[tuple[str, ...], Callable[[Mapping[str, Any]], _Raw]], ...] = tuple(
-    (names, reader if callable(reader) else _named(reader, *names))
-    for names, reader in (
-        (("root_trans_offset", "root_rot", "dof"), "pickle of a motion library"),
-        (("root_pos", "root_rot", "dof_pos"), "pickle of a retargeter"),
-        (("base_position_m", "base_quaternion_xyzw", "joint_position_rad"), "arrays with units"),
-        (("body_pos_w", "body_quat_w", "joint_pos"), _of_tracker),
-        (("base_pos_w", "base_quat_w", "joint_pos"), _of_base),
-        (("root_translateX", "root_rotateX"), _of_animation),
-        (("qpos",), _of_mujoco),
-        (("q", "t", "joint_names"), lambda x: _of_rows(x["q"], "a plan or simulation")),
-        (("rows",), lambda x: _of_rows(x["rows"], "rows of numbers")),
-        (("base_x_m", "base_qw"), _of_table),
-    )
-)
-
-
-def _entries(content: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any], Callable]]:
-    """Clips of a file: name, content, and what reads it; files may hold many by name."""
+def _entries(content: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any], tuple]]:
+    """Clips of a file: name, content, and its form; files may hold many by name."""
     if isinstance(content, Mapping):
-        for names, reader in FORMS:
+        for names in FORMS:
             if set(names) <= content.keys():
-                yield name, content, reader
+                yield name, content, names
                 return
         for key, part in content.items():
             yield from _entries(part, str(key))
@@ -276,17 +267,18 @@ def read_clips(
         raise InputError(f"fps = {fps:g} must lie above 0 and not above 10000")
     content = _content(path)
     found = []
-    for name, x, reader in _entries(content, path.stem):
+    for name, x, names in _entries(content, path.stem):
         where = f"{path}" if name == path.stem else f"{path}, clip {name!r}"
         try:
-            raw = reader(x)
+            form = FORMS[names]
+            raw = _of_arrays(form, x, names) if isinstance(form, str) else form(x)
             raw = replace(raw, fps=_rate(x), names=raw.names or _names(x))
         except (KeyError, IndexError, TypeError, ValueError) as e:
             raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
         found.append(_clip(where, name, raw, robot, fps, order))
     if not found:
         keys = list(content)[:6] if isinstance(content, Mapping) else quoted(content)
-        known = "; ".join(", ".join(names) for names, _ in FORMS)
+        known = "; ".join(map(", ".join, FORMS))
         raise InputError(f"{path}: holds no clip, but {keys}; a clip has one of: {known}")
     return found if len(found) > 1 else [replace(found[0], name=path.stem)]
 

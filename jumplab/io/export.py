@@ -206,17 +206,13 @@ def with_base(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
     """What trainers in Isaac Lab keep of a motion: joints breadth-first, by name, and the base,
     (F, 3) and quaternion (F, 4) w x y z, velocities in world axes at its origin; 32-bit floats.
     """
-    base, turn, speed, spin = whole.bodies(x, whole.links[:1], at_com=False).values()
     arrays = tracked(whole, x, fps, order=ORDERS[1])
-    kept = {k: arrays[k] for k in ("fps", "joint_pos", "joint_vel", "joint_torque")}
-    places = {"base_pos_w": base, "base_quat_w": turn}
-    places |= {"base_lin_vel_w": speed, "base_ang_vel_w": spin}
-    return {
-        "framerate": np.array(float(fps)),
-        **kept,
-        **{name: array[:, 0].astype(np.float32) for name, array in places.items()},
-        **{k: arrays[k] for k in ("contact", "phase", "joint_names")},
-    }
+    arrays.pop("body_names")
+    out = {"framerate": np.array(float(fps))}
+    for name, array in arrays.items():
+        body = name.startswith("body_")
+        out[name.replace("body_", "base_")] = array[:, 0] if body else array
+    return out
 
 
 def library_entry(
@@ -320,17 +316,12 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     for name in whole.joints:
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         joint = spec.joint(name)
-        if name in whole.robot.actuators:
-            effort = whole.robot.actuators[name]["effort"]
-            joint.actfrcrange = [-effort, effort]
+        if own := whole.robot.actuators.get(name):
+            joint.actfrcrange = [-own["effort"], own["effort"]]
+            joint.armature = own["armature"]
+            joint.frictionloss = own["friction"]
+            joint.damping = [own["damping"], 0.0, 0.0]  # of a polynomial in the rate
         motor.ctrlrange = joint.actfrcrange
-    motors = whole.robot.motors
-    for name, value in motors["armature"].items():
-        spec.joint(name).armature = value
-    for name, value in motors["friction"].items():
-        spec.joint(name).frictionloss = value
-    for name, value in motors["damping"].items():
-        spec.joint(name).damping = [value, 0.0, 0.0]  # of a polynomial in the rate
     spec.compile()
     qpos, qvel = _qpos_qvel(x)
     arrays = {

@@ -110,12 +110,10 @@ def _finish(folder: Path) -> None:
     if not commit.is_dir():
         return
     names = {p.name for p in commit.iterdir()}
-    stale = {n for n in names if n.endswith(".json")}
-    if PLAN in names:
-        stale |= set(OF_PLAN)
-    if "simulation.npz" in names:
-        stale |= set(OF_SIMULATION)
-    for name in sorted(stale):
+    stale = [n for n in names if n.endswith(".json")]
+    stale += OF_PLAN if PLAN in names else ()
+    stale += OF_SIMULATION if "simulation.npz" in names else ()
+    for name in stale:
         _remove(folder / name)
     for name in sorted(names, key=lambda n: (n != PLAN, n == SUMMARY, n.endswith(".json"), n)):
         if (folder / name).is_dir():  # a folder takes no other's place

@@ -11,7 +11,7 @@ import pinocchio as pin
 from jumplab.errors import InputError, RobotError
 from jumplab.io.motion import Motion, steady
 from jumplab.robot import Robot
-from jumplab.robot.files import entry, read_toml, table
+from jumplab.robot.files import entry, numbers, read_toml
 
 ORDERS = ("depth-first", "breadth-first")  # of links and joints: MuJoCo's and Isaac Lab's
 # [m] joints of both robots may be apart: twice what left and right are evened out by at most
@@ -44,11 +44,10 @@ class Whole:
                 f"robot {robot.name}: [published] holds no URDF: {str(e).splitlines()[0]}"
             ) from e
         self.model.gravity.linear = np.array([0.0, 0.0, -robot.gravity])
-        held = table(table(config, "published"), "held")
-        self._held = {name: entry(config, "published", "held", name) for name in held}
+        self._held = numbers(config, "published", "held")
         trunk = entry(config, "published", "trunk", kind=str, default=self.links[0])
         self._trunk = self._frame(trunk)
-        for name in (*robot.joint_names, *held):
+        for name in (*robot.joint_names, *self._held):
             if name not in self.joints:
                 raise RobotError(f"robot {robot.name}: [published] lacks the joint {name!r}")
         self._order = self._columns(self.joints)
@@ -66,19 +65,14 @@ class Whole:
 
     def states(self, x: Motion) -> tuple[np.ndarray, np.ndarray]:
         """Configurations (F, nq) and velocities (F, nv) of :meth:`frames` in Pinocchio's order."""
-        return self._in_order(x.q, 7), self._in_order(x.v, 6)
+        back = np.argsort(self._order)
+        return _sorted(x.q, back), _sorted(x.v, back)
 
     def com(self, q: np.ndarray) -> np.ndarray:
         """CoM (F, 3) [m] at configurations (F, nq) of :meth:`frames`."""
         data = self.model.createData()
-        rows = self._in_order(q, 7)
+        rows = _sorted(q, np.argsort(self._order))
         return np.array([pin.centerOfMass(self.model, data, row).copy() for row in rows])
-
-    def _in_order(self, values: np.ndarray, base: int) -> np.ndarray:
-        """Rows (F, ``base`` + J) in Pinocchio's order, of such with joints depth-first."""
-        out = values.copy()
-        out[:, base + self._order] = values[:, base:]
-        return out
 
     def frames(self, motion: Motion, fps: float) -> Motion:
         """A motion at ``fps`` [1/s] and at its end, as one of the published robot from time 0 [s],
@@ -111,11 +105,8 @@ class Whole:
         change = np.gradient(v, x.t, axis=0) if len(x.t) > 1 else np.zeros_like(v)
         tau = np.array([pin.rnea(model, data, *row)[6:] for row in zip(q, v, change, strict=True)])
         tau[:, self._jumping] = x.tau
-        order = self._order
-        q = np.hstack([q[:, :7], q[:, 7 + order]])
-        v = np.hstack([v[:, :6], v[:, 6 + order]])
-        t = x.t - x.t[0]
-        return Motion(t, q, v, tau[:, order], x.phase, x.source, x.wrench, x.contact)
+        states = (_sorted(rows, self._order) for rows in (q, v, tau))
+        return Motion(x.t - x.t[0], *states, x.phase, x.source, x.wrench, x.contact)
 
     def own(self, q: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
         """The inverse of :meth:`frames`: configurations (F, nq) of the robot that jumps, from those
@@ -123,7 +114,7 @@ class Whole:
         off where they are held [rad].
         """
         data = self.model.createData()
-        state = self._in_order(q, 7)
+        state = _sorted(q, np.argsort(self._order))
         places = []
         for row in state:
             pin.forwardKinematics(self.model, data, row)
@@ -181,6 +172,12 @@ class Whole:
             "body_lin_vel_w": speed,
             "body_ang_vel_w": spin,
         }
+
+
+def _sorted(rows: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Rows (F, n) whose last columns, the joints, are in another ``order`` (J,)."""
+    joints = rows[:, -len(order) :]
+    return np.hstack([rows[:, : -len(order)], joints[:, order]])
 
 
 def ordered(urdf: str, order: str = ORDERS[0]) -> tuple[tuple[str, ...], tuple[str, ...]]:

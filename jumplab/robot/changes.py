@@ -6,10 +6,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import tomlkit
 
 from jumplab.arguments import real
@@ -20,8 +21,6 @@ from jumplab.robot.sagittal import SAGITTAL_JOINTS
 if TYPE_CHECKING:
     from jumplab.robot.description import Robot
 
-# of a URDF's <limit>
-ATTRIBUTES = {"effort": "effort", "speed": "velocity", "lower": "lower", "upper": "upper"}
 MOST = 1e9  # factor or number of a changed robot
 UNITS = {"effort": "N m", "speed": "rad/s", "lower": "rad", "upper": "rad"}
 ENDS = {"lower": "upper", "upper": "lower"}  # of a range, and the other one
@@ -42,33 +41,27 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
     new: dict[str, dict[str, float]] = {name: {} for name in robot.joint_names}
     for what, given in factors.items():
         if not isinstance(given, Mapping):
-            factor = _number(robot, f"the factor on {what}", given, positive=True)
+            factor = _number(robot, f"the factor on {what}", given)
             given = dict.fromkeys(robot.joint_names, factor)
         for key, names in _joints(robot, given, f"the factors on {what}"):
-            factor = _number(robot, f"the factor on {what} of {key!r}", given[key], positive=True)
+            factor = _number(robot, f"the factor on {what} of {key!r}", given[key])
             for name in names:
                 new[name][what] = robot.actuators[name][what] * factor
     signs = {name: sign for name, _, sign in robot.role_signs()}
     for key, names in _joints(robot, ranges, "the ranges"):
-        if not (
-            isinstance(ranges[key], Mapping)
-            and 0 < len(ranges[key])
-            and set(ranges[key]) <= set(UNITS)
-        ):
+        told = ranges[key]
+        if not (isinstance(told, Mapping) and told and set(told) <= set(UNITS)):
             raise robot.error(
                 f"the limits of {key!r} are lower, upper [rad], effort [N m], speed [rad/s], got "
-                f"{quoted(ranges[key])}"
+                f"{quoted(told)}"
             )
-        for end, angle in ranges[key].items():
-            motor = end not in ENDS
-            angle = _number(robot, f"{end} of {key!r} [{UNITS[end]}]", angle, positive=motor)
+        for end, value in told.items():
+            what = f"{end} of {key!r} [{UNITS[end]}]"
+            value = _number(robot, what, value, positive=end not in ENDS)
             for name in names:
-                if motor:
-                    new[name][end] = angle
-                    continue
                 # it turns against its role
-                other = key not in robot.joint_names and signs[name] < 0
-                new[name][ENDS[end] if other else end] = -angle if other else angle
+                turned = end in ENDS and key not in robot.joint_names and signs[name] < 0
+                new[name][ENDS[end] if turned else end] = -value if turned else value
     root = _parsed(robot)
     remarks = []
     for joint in root.findall("joint"):
@@ -77,7 +70,7 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
             old = robot.actuators[name][what]
             text = f"{value:.12g}"
             if float(text) != old:
-                joint.find("limit").set(ATTRIBUTES[what], text)
+                joint.find("limit").set("velocity" if what == "speed" else what, text)
                 remarks.append(f"{what} of joint {name!r}, {old:.12g} -> {text} {UNITS[what]}")
     return _text(root), remarks
 
@@ -113,9 +106,9 @@ def masses(
         if not old > 0:
             raise robot.error(f"the link {link!r} has no mass, so its inertia cannot scale with it")
         if factor is None:
-            share = _number(robot, f"mass_kg of {link!r}", mass_kg, positive=True) / old
+            share = _number(robot, f"mass_kg of {link!r}", mass_kg) / old
         else:
-            share = _number(robot, f"the factor on the mass of {link!r}", factor, positive=True)
+            share = _number(robot, f"the factor on the mass of {link!r}", factor)
         if f"{old * share:.12g}" != f"{old:.12g}":
             for part in bodies[link]:
                 scale(part.find("mass"), ("value",), share)
@@ -131,7 +124,7 @@ def gears(robot: Robot, ratios: Mapping) -> str:
     """
     config = tomlkit.parse(robot.config_text)
     for key, names in _joints(robot, ratios, "the gears"):
-        ratio = _number(robot, f"the factor on the gear of {key!r}", ratios[key], positive=True)
+        ratio = _number(robot, f"the factor on the gear of {key!r}", ratios[key])
         for name in names:
             for what, power in GEARED.items():
                 if lost := robot.actuators[name][what]:
@@ -146,21 +139,15 @@ def legs(robot: Robot, factor: float, thigh: float, shank: float) -> tuple[str, 
 
     Raises :class:`RobotError` as :meth:`.Robot.with_legs` says.
     """
-    both = _number(robot, "the factor on the legs", factor, positive=True)
+    both = _number(robot, "the factor on the legs", factor)
     own = {"thighs": thigh, "shanks": shank}
-    factors = [
-        both * _number(robot, f"the factor on the {part}", x, positive=True)
-        for part, x in own.items()
-    ]
+    factors = [both * _number(robot, f"the factor on the {part}", x) for part, x in own.items()]
     root = _parsed(robot)
     remarks = []
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     links = {link.get("name"): link for link in root.findall("link")}
-    for name, end, factor in [
-        (*pair, factor)
-        for (here, there), factor in zip(pairwise(LEG), factors, strict=True)
-        for pair in zip(robot.joints[here], robot.joints[there], strict=True)
-    ]:
+    ends = (zip(robot.joints[a], robot.joints[b], strict=True) for a, b in pairwise(LEG))
+    for (name, end), factor in zip(chain(*ends), np.repeat(factors, 2), strict=True):
         link = joints[name].find("child").get("link")
         origin = joints[end].find("origin")
         x, y, z = (abs(float(number)) for number in origin.get("xyz").split())
@@ -223,7 +210,7 @@ def _joints(robot: Robot, given: Mapping, where: str) -> list[tuple[str, Sequenc
     return pairs
 
 
-def _number(robot: Robot, what: str, value: Any, positive: bool = False) -> float:
+def _number(robot: Robot, what: str, value: Any, positive: bool = True) -> float:
     try:
         number = real(value, what)
     except InputError:

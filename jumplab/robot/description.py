@@ -19,31 +19,24 @@ from jumplab.arguments import checked, real
 from jumplab.errors import RobotError, Shown, quoted, require_type
 from jumplab.robot import changes, foreign
 from jumplab.robot.files import (
+    MOTORS,
     ROLES,
     SHIPPED,
+    STANCE,
     TABLES,
     check_entries,
     entry,
     files_of,
+    numbers,
     read_text,
     read_toml,
     roles_table,
-    table,
 )
 from jumplab.robot.motors import MotorLimits, read_only
 from jumplab.robot.reduction import in_plane
 from jumplab.robot.sagittal import SagittalModel, reduce
 from jumplab.robot.stance import check_stance, standing
 from jumplab.task import GRAVITY
-
-MOTORS = {
-    "corner_speed_ratios": None,  # that of all joints
-    "no_load_ratios": 1.0,
-    "armature": 0.0,
-    "friction": 0.0,
-    "damping": 0.0,
-}  # tables of [actuators], and defaults
-STANCE = ("knee_rad", "trunk_pitch_rad", "shoulder_rad")
 
 
 @dataclass(frozen=True)
@@ -143,13 +136,6 @@ class Robot(Shown):
         config = read_toml(self.config_text, "robot configuration")
         check_entries(config, TABLES)
         get = partial(entry, config)
-
-        def numbers(*path: str) -> Mapping[str, float]:
-            rows = config
-            for key in path:
-                rows = table(rows, key)
-            return MappingProxyType({name: get(*path, name) for name in rows})
-
         x = get("feet", "sole_x_m", count=2)
         y = get("feet", "sole_y_m", count=2)
         links = get("feet", "links", kind=str, count=2)
@@ -165,14 +151,15 @@ class Robot(Shown):
                 f"robot configuration: corner_speed_ratio = {corner:g} must lie between 0 and 1"
             )
         stance = {key: get("stance", key) for key in STANCE}
+        motors = {key: MappingProxyType(numbers(config, "actuators", key)) for key in MOTORS}
         values = {
             "name": get("name", kind=str),
             "joints": MappingProxyType(roles_table(config)),
             "foot": foot,
             "stance": MappingProxyType(stance),
-            "rest": numbers("rest"),
+            "rest": MappingProxyType(numbers(config, "rest")),
             "corner_speed_ratio": corner,
-            "motors": MappingProxyType({key: numbers("actuators", key) for key in MOTORS}),
+            "motors": MappingProxyType(motors),
         }
         for key, value in values.items():
             object.__setattr__(self, key, value)  # once: from here on the dataclass is frozen

@@ -24,22 +24,24 @@ SHIPPED = {
 }
 ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
 LEG = ROLES[:3]
+# tables of [actuators], and what holds of a joint that they do not name
+MOTORS = {
+    "corner_speed_ratios": None,  # that of all joints
+    "no_load_ratios": 1.0,
+    "armature": 0.0,
+    "friction": 0.0,
+    "damping": 0.0,
+}
+STANCE = ("knee_rad", "trunk_pitch_rad", "shoulder_rad")
 # what the TOML file of a robot holds: its tables and their entries; () for names of the robot
 TABLES = {
     "name": None,
     "urdf": None,
     "joints": ROLES,
     "feet": ("links", "sole_x_m", "sole_y_m", "sole_z_m"),
-    "stance": ("knee_rad", "trunk_pitch_rad", "shoulder_rad"),
+    "stance": STANCE,
     "rest": (),
-    "actuators": (
-        "corner_speed_ratio",
-        "corner_speed_ratios",
-        "no_load_ratios",
-        "armature",
-        "friction",
-        "damping",
-    ),
+    "actuators": ("corner_speed_ratio", *MOTORS),
     "published": ("trunk", "xyz_m", "rpy_rad", "urdf", "held"),
     "source": (),  # where the URDF came from; only the importer reads it
 }
@@ -190,14 +192,11 @@ def entry(
             raise RobotError(f"robot configuration: the entry {where!r} is missing")
         value = value[key]
     items = value if count else [value]
-    numbers = kind is float
+    types, wanted = ((int, float), "a finite number") if kind is float else ((str,), "a text")
     good = isinstance(items, list) and len(items) == (count or 1)
-    good = good and all(
-        isinstance(x, (int, float) if numbers else str) and not isinstance(x, bool) for x in items
-    )
-    if not good or (numbers and not np.all(np.isfinite(items))):
+    good = good and all(type(x) in types for x in items)
+    if not good or (kind is float and not np.all(np.isfinite(items))):
         many = f"{count} of " if count else ""
-        wanted = "a finite number" if numbers else "a text"
         raise RobotError(f"robot configuration: {where!r} = {value!r}, must be {many}{wanted}")
     clean = [kind(x) for x in items]
     return clean if count else clean[0]
@@ -229,6 +228,14 @@ def table(config: dict, name: str) -> dict:
     if not isinstance(value, dict):
         raise RobotError(f"robot configuration: {name!r} = {value!r} must be a table [{name}]")
     return value
+
+
+def numbers(config: dict, *path: str) -> dict[str, float]:
+    """A table, or one within another, of finite numbers by name; {} where it is missing."""
+    rows = config
+    for key in path:
+        rows = table(rows, key)
+    return {name: entry(config, *path, name) for name in rows}
 
 
 def roles_table(config: dict) -> dict[str, tuple[str, ...]]:

@@ -7,8 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-_importers: list[Callable[..., Any]] = []
-_checks: list[Callable[..., None]] = []
+_registered: list[Callable[..., Any]] = []
 
 
 def register(importer: Callable[..., Any], check: Callable[..., None]) -> None:
@@ -16,17 +15,14 @@ def register(importer: Callable[..., Any], check: Callable[..., None]) -> None:
     ``check(urdf, config_text, where)`` refuse pairs by the same rules; without ``where`` it is a
     robot of this package's own making, whose motors may be what no file has.
     """
-    _importers[:] = [importer]
-    _checks[:] = [check]
+    _registered[:] = importer, check
 
 
 def check(urdf: str, config_text: str, where: str = "") -> None:
     """Let the registered check refuse a pair of texts; ``where`` names the URDF's file."""
-    (registered,) = _checks
-    registered(urdf, config_text, where)
+    _registered[1](urdf, config_text, where)
 
 
 def load(name_or_path: Any, repair: tuple[str, ...]) -> Any:
     """The :class:`.Robot` that the registered importer makes of a file; raises what it raises."""
-    (importer,) = _importers
-    return importer(name_or_path, repair)
+    return _registered[0](name_or_path, repair)

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.robot.contact import Anchor, on_feet
+from jumplab.robot.files import LEG
 from jumplab.robot.stance import stance_configuration
 
 if TYPE_CHECKING:
@@ -86,8 +87,7 @@ def segments_m(robot: Robot) -> tuple[float, float]:
     """Lengths of thigh and shank of the left leg, between its pitch axes [m]."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, pin.neutral(robot.model))
-    roles = "hip_pitch", "knee", "ankle_pitch"
-    joints = [robot.model.getJointId(robot.joints[role][0]) for role in roles]
+    joints = [robot.model.getJointId(robot.joints[role][0]) for role in LEG]
     places = np.array([data.oMi[joint].translation[[0, 2]] for joint in joints])
     thigh, shank = np.linalg.norm(np.diff(places, axis=0), axis=1)
     return float(thigh), float(shank)
@@ -152,27 +152,16 @@ def bring_feet(
     q = q.copy()
     for left in range(steps, -1, -1):
         pin.computeJointJacobians(model, data, q)
-        missed, rows = _missed(model, data, goals)
-        if not left or np.abs(missed).max() < near:
+        places = {a: data.oMi[a.joint] * a.placement for a in goals}
+        ways = np.array([pin.log6(places[a].actInv(goal)).vector for a, goal in goals.items()])
+        if not left or np.abs(ways).max() < near:
             break
-        step = least_motion(rows, missed, give, damping)
+        rows = [pin.getFrameJacobian(model, data, a.joint, a.placement, LOCAL) for a in goals]
+        step = least_motion(np.concatenate(rows), ways.ravel(), give, damping)
         q = pin.integrate(model, q, np.clip(step, -most_rad, most_rad))
         if limits is not None:
             q[7:] = np.clip(q[7:], *limits)
-    return q, missed.reshape(-1, 6)
-
-
-def _missed(
-    model: pin.Model, data: pin.Data, goals: Mapping[Anchor, pin.SE3]
-) -> tuple[np.ndarray, np.ndarray]:
-    """What is missed of all goals (6 k,), and the slope of what is reached (6 k, nv)."""
-    missed = []
-    rows = []
-    for anchor, goal in goals.items():
-        place = data.oMi[anchor.joint] * anchor.placement
-        missed.append(pin.log6(place.actInv(goal)).vector)
-        rows.append(pin.getFrameJacobian(model, data, anchor.joint, anchor.placement, LOCAL))
-    return np.concatenate(missed), np.concatenate(rows)
+    return q, ways
 
 
 def least_motion(

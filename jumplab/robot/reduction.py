@@ -58,17 +58,12 @@ def in_plane(robot: Robot) -> bool:
     axes = pin.computeJointJacobians(model, model.createData(), pin.neutral(model))[4]
     pitch = [axes[model.idx_vs[model.getJointId(name)]] for name in roles]
     try:
-        ranges = robot.sagittal is not None
+        _ = robot.sagittal
     except RobotError:  # left and right share no angle
-        ranges = False
+        return False
     mirrored = len({i for row in pairs for i in row[:2]}) == model.nv - 6
-    return (
-        ranges
-        and mirrored
-        and even_masses(model, pairs)
-        and not free
-        and min(np.abs(pitch)) > PARALLEL
-    )
+    alike = mirrored and even_masses(model, pairs)
+    return alike and not free and min(np.abs(pitch)) > PARALLEL
 
 
 def even_masses(model: pin.Model, pairs: list[tuple[int, int, float]]) -> bool:

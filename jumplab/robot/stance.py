@@ -195,12 +195,11 @@ def knees(robot: Robot) -> list[tuple[int, float, float]]:
 
 def rest_angles(robot: Robot) -> np.ndarray:
     """Angles (nv - 6,) [rad] told for the standing posture, else 0 or well inside the range."""
-    rows = [robot.actuators[name] for name in robot.joint_names]
-    low, high = (np.array([r[key] for r in rows]) for key in ("lower", "upper"))
+    low = robot.limits.lower
+    high = robot.limits.upper
     room = np.minimum(2 * STANCE_ROOM_RAD, (high - low) / 3)
-    return np.clip(
-        [robot.rest.get(name, 0.0) for name in robot.joint_names], low + room, high - room
-    )
+    told = [robot.rest.get(name, 0.0) for name in robot.joint_names]
+    return np.clip(told, low + room, high - room)
 
 
 def standing(robot: Robot) -> np.ndarray:
@@ -277,11 +276,10 @@ def holding(robot: Robot, q: np.ndarray, friction: float) -> tuple[float, str, f
     pin.computeJointJacobians(model, data, q)
     level = friction / np.sqrt(2)
     edges = np.array([[x, y, 1.0] for x in (-level, level) for y in (-level, level)])
-    corners = [on_feet(robot, corner) for corner in robot.foot.corners]
-    anchors = [anchor for foot in zip(*corners, strict=True) for anchor in foot]
+    anchors = [on_feet(robot, corner)[side] for side in (0, 1) for corner in robot.foot.corners]
     slopes = [pin.getFrameJacobian(model, data, a.joint, a.placement, WORLD)[:3] for a in anchors]
     pushed = np.concatenate([edges @ slope for slope in slopes]).T
-    effort = np.array([robot.actuators[name]["effort"] for name in robot.joint_names])
+    effort = robot.limits.effort
     cost = np.append(np.zeros(pushed.shape[1]), 1.0)
     rows = np.block([[-pushed[6:], -effort[:, None]], [pushed[6:], -effort[:, None]]])
     base = np.hstack([pushed[:6], np.zeros((6, 1))])

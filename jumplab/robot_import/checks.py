@@ -70,7 +70,9 @@ def read_tree(
     root = parse(text, where)
     for sentence in faults(root, where, repair):
         raise RobotError(sentence)
-    return Tree(root, where, path, "inertia" in repair)
+    tree = Tree(root, where, path, "inertia" in repair)
+    tree.text = text
+    return tree
 
 
 def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[str]:
@@ -128,9 +130,9 @@ def _losses(moving: list[Joint]) -> Iterator[str]:
     wrong = {}  # (key, text) -> joints
     for joint in moving:
         told = joint.element.find("dynamics")
-        for key in OWN if told is not None else ():
-            if key in told.attrib and finite(told, (key,)).get(key, -1.0) < 0:
-                wrong.setdefault((key, told.get(key)), []).append(repr(joint.name))
+        for key, text in told.items() if told is not None else ():
+            if key in OWN and finite(told, (key,)).get(key, -1.0) < 0:
+                wrong.setdefault((key, text), []).append(joint.name)
     for (key, text), joints in wrong.items():
         yield f"{key} = {text!r} of {listed(joints)} must be a number from 0 on: not used"
     used = Counter(key for joint in moving for key in joint.losses)
@@ -217,20 +219,20 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
         if len(hanging) > 1:
             yield (
                 f"{where}: link {link!r} hangs on {len(hanging)} joints "
-                f"({', '.join(map(repr, hanging))}): a closed loop; cut it to leave a tree"
+                f"({listed(hanging)}): a closed loop; cut it to leave a tree"
             )
             return
     roots = sorted(names - set(above))
     if len(roots) > 1:
         yield (
-            f"{where}: {len(roots)} links have no parent ({listed(map(repr, roots))}), Pinocchio "
+            f"{where}: {len(roots)} links have no parent ({listed(roots)}), Pinocchio "
             f"keeps one tree and drops the rest; connect them"
         )
         return
     below = list(roots)
     for link in below:
         below += [child for child, hanging in above.items() if link in hanging.values()]
-    if lost := listed(map(repr, sorted(names - set(below)))):
+    if lost := listed(sorted(names - set(below))):
         end = ": each robot needs one link without a parent"
         if roots:
             end = f" apart from the root {roots[0]!r}"
@@ -304,40 +306,39 @@ def _massless_bodies(tree: Tree) -> Iterator[str]:
         weighs = tree.body_of(link).mass > 0 or tree.elements[link].get("between")
         if joint.kind == "fixed" or weighs or not tree.carried(link):
             continue
+        fault = f"mass = 0 kg, the body of joint {joint.name!r} must weigh more than 0 kg"
         if tree.elements[link].find("inertial") is None:
-            yield (
-                f"{at}: has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, "
-                f"PyBullet 1 kg; joint {joint.name!r} needs a body of more than 0 kg, {remedy}"
+            fault = (
+                f"has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, PyBullet "
+                f"1 kg; joint {joint.name!r} needs a body of more than 0 kg"
             )
-        else:
-            yield (
-                f"{at}: mass = 0 kg, the body of joint {joint.name!r} must weigh more than 0 kg, "
-                f"{remedy}"
-            )
+        yield f"{at}: {fault}, {remedy}"
 
 
 # units and shapes
 # -----------------------------------------------------------------------------------------------
 def _unit_faults(tree: Tree) -> Iterator[str]:
     """Total mass and size that no humanoid has in kg and m."""
-    mass = tree.mass
-    low, high = MASSES_KG
-    if not low <= mass <= high:
-        guess = "grams? divide by 1000" if mass > high else "tonnes, or are inertials missing?"
-        yield (
-            f"{tree.where}: weighs {mass:g} kg, a humanoid {low:g} to {high:g}; are the masses "
-            f"in {guess}"
-        )
-    size = length_of(tree)
-    low, high = SIZES_M
-    if not low <= size <= high:
-        guess = "kilometres, or are the origins missing?"
-        if size > high:
-            guess = "millimetres? divide by 1000"
-        yield (
-            f"{tree.where}: the longest chain of joints measures {size:g} m, a humanoid's {low:g} "
-            f"to {high:g}; are the origins in {guess}"
-        )
+    for value, (low, high), sentence, few, many in (
+        (
+            tree.mass,
+            MASSES_KG,
+            "weighs {:g} kg, a humanoid {:g} to {:g}; are the masses in {}",
+            "tonnes, or are inertials missing?",
+            "grams? divide by 1000",
+        ),
+        (
+            length_of(tree),
+            SIZES_M,
+            "the longest chain of joints measures {:g} m, a humanoid's {:g} to {:g}; are the "
+            "origins in {}",
+            "kilometres, or are the origins missing?",
+            "millimetres? divide by 1000",
+        ),
+    ):
+        if not low <= value <= high:
+            guess = many if value > high else few
+            yield f"{tree.where}: {sentence.format(value, low, high, guess)}"
 
 
 def length_of(tree: Tree) -> float:

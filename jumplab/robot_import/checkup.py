@@ -14,9 +14,12 @@ from jumplab.robot.description import Robot
 from jumplab.robot.files import files_of, read_toml, roles_table
 from jumplab.robot.stance import check_stance, stance_configuration
 from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.jumper import REPAIRS, Jumper, make_jumper
+from jumplab.robot_import.jumper import REPAIRS, make_jumper, source_of
+from jumplab.robot_import.lump import Lumped
 from jumplab.robot_import.roles import Draft, draft
-from jumplab.robot_import.urdf import MOVING, locate, parse, read_urdf
+from jumplab.robot_import.urdf import MOVING, Tree, locate, parse, read_urdf
+
+COLUMNS = ("role", "left", "right", "axes", "range", "N m", "rad/s")
 
 
 @dataclass(frozen=True)
@@ -24,35 +27,36 @@ class Checkup:
     """A robot that can be planned with, and how it came about."""
 
     robot: Robot
-    jumper: Jumper  # its lumped bodies and the URDF as it was
+    lumped: Lumped  # its bodies
+    tree: Tree  # the URDF as it was
 
     def rows(self) -> list[dict]:
         """One row per role: joints, direction of their axes, range, torque and speed."""
         s = self.robot.sagittal
         out = []
         for i, (role, pair) in enumerate(self.robot.joints.items()):
-            row = dict.fromkeys(("role", "left", "right", "axes", "range", "N m", "rad/s"), "")
-            row |= {"role": role.replace("_", " "), "left": "held", "right": "held"}
+            values = ("held", "held", "", "", "", "")
             if pair:
-                row["left"], row["right"] = pair
-                row["axes"] = " ".join("+y" if x > 0 else "-y" for x in s.signs[i])
-                row["range"] = f"{s.lower[i]:+.2f} ... {s.upper[i]:+.2f}"
-                row["N m"] = f"{s.effort[i] / 2:.4g}"
-                row["rad/s"] = f"{s.speed[i]:.4g}"
-            out.append(row)
+                values = (
+                    *pair,
+                    " ".join("+y" if x > 0 else "-y" for x in s.signs[i]),
+                    f"{s.lower[i]:+.2f} ... {s.upper[i]:+.2f}",
+                    f"{s.effort[i] / 2:.4g}",
+                    f"{s.speed[i]:.4g}",
+                )
+            out.append(dict(zip(COLUMNS, (role.replace("_", " "), *values), strict=True)))
         return out
 
     def lines(self) -> list[str]:
         """What else is worth knowing, a line each."""
         r = self.robot
-        tree = self.jumper.tree
         moving = len(r.joint_names)
         foot = r.foot
         com = pin.centerOfMass(r.model, r.model.createData(), stance_configuration(r))
-        movable = sum(joint.kind in MOVING for joint in tree.joints.values())
-        out = [
-            f"robot {r.name}: {r.total_mass:.3f} kg ({tree.mass:.3f} kg in the XML), {moving} of "
-            f"{movable} joints move, {len(self.jumper.lumped.held)} are held off zero",
+        movable = sum(joint.kind in MOVING for joint in self.tree.joints.values())
+        return [
+            f"robot {r.name}: {r.total_mass:.3f} kg ({self.tree.mass:.3f} kg in the XML), "
+            f"{moving} of {movable} joints move, {len(self.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
             f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
             f"standing: CoM {com[2]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "
@@ -60,48 +64,46 @@ class Checkup:
             "five links describe it"
             if r.planar
             else "no five links describe it: jumps are planned directly, not in three steps",
-        ]
-        return out + [
-            f"changed: {what}: {x:.3g} {unit}"
-            for what, (x, unit) in self.jumper.lumped.changed.items()
+            *(f"changed: {k}: {x:.3g} {unit}" for k, (x, unit) in self.lumped.changed.items()),
         ]
 
 
-def first_look(
-    path: str | Path, repair: tuple[str, ...] = (), text: str | None = None
-) -> tuple[Draft | None, list[str]]:
+def first_look(path: str | Path, repair: tuple[str, ...] = ()) -> tuple[Draft | None, list[str]]:
     """A first description of a URDF, and every fault of the file, else of the limits of the joints
     with a role.
 
     With faults of the file the roles are those that it has once all repairs are allowed; None if
-    not even then. ``text`` is what :func:`.urdf.read_urdf` has read of it, if it was read before.
-    Raises :class:`RobotError` if it is no URDF at all, or has no two legs.
+    not even then. Raises :class:`RobotError` if it is no URDF at all, or has no two legs.
     """
     path = Path(path)
-    text = read_urdf(path) if text is None else text
-    if not (faults := urdf_checks.faults(parse(text, path.name), path.name, repair)):
-        first = draft(path, repair, text)
-        return first, list(first.faults)
     try:
-        return draft(path, REPAIRS, text), faults
+        first = draft(path, repair)
+        return first, list(first.faults)
+    except RobotError:
+        faults = urdf_checks.faults(parse(read_urdf(path), path.name), path.name, repair)
+        if not faults:
+            raise
+    try:
+        return draft(path, REPAIRS), faults
     except RobotError:
         return None, faults
 
 
-def check(path: str | Path, config_text: str, text: str | None = None) -> Checkup:
+def check(path: str | Path, config_text: str, tree: Tree | None = None) -> Checkup:
     """The robot of a URDF and a configuration with [source]; raises :class:`RobotError`.
 
-    ``text`` as of :func:`first_look`.
+    ``tree`` is that of its :class:`.roles.Draft`, if there is one.
     """
     path = Path(path)
     config = read_toml(config_text, "robot configuration")
     if "source" not in config:
         missing = "the table [source] is missing: it names trunk, forward, up and repair"
         raise RobotError(f"robot configuration: {missing}")
-    jumper = make_jumper(read_urdf(path) if text is None else text, config, path.name, path)
-    robot = Robot(jumper.urdf, jumper.config_text)
-    check_stance(robot)
-    return Checkup(robot, jumper)
+    repair = source_of(config)["repair"]
+    tree = tree or urdf_checks.read_tree(read_urdf(path), path.name, path, repair)
+    result = Checkup(*make_jumper(tree, config), tree)
+    check_stance(result.robot)
+    return result
 
 
 def check_texts(urdf: str, config_text: str, where: str) -> None:
@@ -130,10 +132,10 @@ def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
     """The checkup of a name or a path; roles are found where no table [source] tells them."""
     urdf, folder, config = files_of(robot)
     path = locate(urdf, folder)
-    text = read_urdf(path)
-    if config is None or "source" not in read_toml(config, "robot configuration"):
-        config = draft(path, repair, text).text
-    return check(path, config, text)
+    if config is not None and "source" in read_toml(config, "robot configuration"):
+        return check(path, config)
+    first = draft(path, repair)
+    return check(path, first.text, first.tree)
 
 
 def load(name_or_path: str | Path, repair: tuple[str, ...] = ()) -> Robot:

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.robot_import.checks import MOST_RAD
-from jumplab.robot_import.urdf import ROUND, Joint, Tree, numbers, placed
+from jumplab.robot_import.urdf import Joint, Tree, numbers, placed
 from jumplab.robot_import.write import listed
 
 # None of these numbers is printed by the paper.
@@ -53,7 +53,7 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     if not kinds:
         x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
         files = [shape.get("filename") for x in tree.below(foot) for _, shape in tree.shapes(x)]
-        lost = listed(sorted({repr(file) for file in files if file}))
+        lost = listed(sorted({*filter(None, files)}))
         source = "GUESSED from the leg's length: the foot has no shape that is at hand"
         source += f", the mesh {lost} is not there" if lost else ""
         return Sole(x, y, leg_m * GUESS_Z, source)
@@ -116,7 +116,7 @@ def _lowest(tree: Tree, shape: ET.Element, place: pin.SE3) -> np.ndarray:
     """(n, 3) points of a placed shape that may touch level ground: one of a sphere, two of a
     capsule or of a cylinder that lies, else its corners.
     """
-    if shape.tag not in ROUND:
+    if not shape.get("radius"):
         return placed(place, tree.corners(shape))
     radius = numbers(shape.get("radius"), 1)[0]
     length = 0.0 if shape.tag == "sphere" else numbers(shape.get("length"), 1)[0]

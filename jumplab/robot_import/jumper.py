@@ -10,9 +10,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import coal
@@ -20,12 +18,20 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot.description import STANCE
-from jumplab.robot.files import LEG, TABLES, check_entries, entry, roles_table, table
-from jumplab.robot_import.checks import read_tree
+from jumplab.robot.description import Robot
+from jumplab.robot.files import (
+    LEG,
+    STANCE,
+    TABLES,
+    check_entries,
+    entry,
+    numbers,
+    roles_table,
+    table,
+)
 from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
-from jumplab.robot_import.urdf import LIMITS, MOVING, OWN, Tree
+from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
 from jumplab.robot_import.write import (
     HERE,
     add_boxes,
@@ -64,39 +70,30 @@ ANY = {"lower": -np.pi, "upper": np.pi, "effort": 0.0, "velocity": 0.0}
 Boxes = list[tuple[np.ndarray, np.ndarray]]  # (centre, size) in the frame of a body [m]
 
 
-@dataclass(frozen=True)
-class Jumper:
-    """A robot that every stage can read, as two texts; its bodies; and the URDF as it was."""
+def make_jumper(tree: Tree, config: dict) -> tuple[Robot, Lumped]:
+    """Lump and rewrite: a robot that every stage can read, and its bodies; raises
+    :class:`RobotError`.
 
-    urdf: str
-    config_text: str
-    lumped: Lumped
-    tree: Tree
-
-
-def make_jumper(urdf: str, config: dict, where: str, path: Path | None = None) -> Jumper:
-    """Check, lump and rewrite; raises :class:`RobotError`.
-
-    ``urdf`` is a text and ``config`` a configuration with a table [source]; ``where`` names the
-    URDF in messages, and meshes are looked for near its ``path``.
+    ``tree`` is that of a URDF, and ``config`` a configuration with a table [source].
     """
     check_entries(config, SOURCE_TABLES)
     config = _facing(config)
-    source = _source(config)
-    tree = read_tree(urdf, where, path, source["repair"])
+    source = source_of(config)
     roles = roles_table(config)
     feet = tuple(entry(config, "feet", "links", kind=str, count=2))
     lumped = lump(tree, config, roles, source, feet)
-    sole = _sole(config, lumped.place(feet[0]).translation, where)
+    sole = _sole(tree, config, lumped.place(feet[0]).translation)
     boxes = _boxes(config, roles, lumped, sole)
-    lumped = _cut_hips(lumped, roles, boxes)
+    _cut_hips(lumped, roles, boxes)
     text = _urdf(entry(config, "name", kind=str), lumped, roles, boxes)
-    config_text = _toml(config, roles, feet, sole, urdf, lumped) + _published(tree, lumped, boxes)
-    return Jumper(text, config_text, lumped, tree)
+    config_text = _toml(config, roles, feet, sole, tree.text, lumped) + _published(
+        tree, lumped, boxes
+    )
+    return Robot(text, config_text), lumped
 
 
-def _source(config: dict) -> dict:
-    """trunk, forward, up, repair of [source]."""
+def source_of(config: dict) -> dict:
+    """trunk, forward, up, repair of [source]; raises :class:`RobotError`."""
     out = {"trunk": entry(config, "source", "trunk", kind=str)}
     for key, default in (("forward", "+x"), ("up", "+z")):
         out[key] = entry(config, "source", key, kind=str, default=default)
@@ -111,12 +108,11 @@ def _source(config: dict) -> dict:
             f"axes"
         )
     repair = table(config, "source").get("repair", [])
-    out["repair"] = tuple(repair if isinstance(repair, list) else [repair])
-    for word in out["repair"]:
-        if word not in REPAIRS:
-            raise RobotError(
-                f"robot configuration: 'source.repair' accepts {', '.join(REPAIRS)}, got {word!r}"
-            )
+    out["repair"] = repair if isinstance(repair, list) else [repair]
+    if wrong := [word for word in out["repair"] if word not in REPAIRS]:
+        raise RobotError(
+            f"robot configuration: 'source.repair' accepts {', '.join(REPAIRS)}, got {wrong[0]!r}"
+        )
     return out
 
 
@@ -128,16 +124,15 @@ def _facing(config: dict) -> dict:
     forward = entry(config, "source", "forward", kind=str, default="+x")
     if facing in ("", forward):
         return config
-    if facing not in AXES or facing[1] != forward[1]:
-        other = forward.translate(str.maketrans("+-", "-+"))
+    other = forward.translate(str.maketrans("+-", "-+"))
+    if facing != other:
         raise RobotError(
             f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, one "
             f"of both ways along which it can walk"
         )
     new = copy.deepcopy(config)
     new["source"]["forward"] = facing
-    for role, pair in roles_table(config).items():
-        new["joints"][role] = list(pair[::-1])
+    new["joints"] |= {role: list(pair[::-1]) for role, pair in roles_table(config).items()}
     feet = new["feet"]
     feet["links"] = entry(config, "feet", "links", kind=str, count=2)[::-1]
     for side in ("sole_x_m", "sole_y_m"):
@@ -150,7 +145,7 @@ def _facing(config: dict) -> dict:
     return new
 
 
-def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
+def _sole(tree: Tree, config: dict, offset: np.ndarray) -> dict[str, float]:
     """The sole in the frame of the foot body, whose link is ``offset`` (3,) [m] from it."""
     ahead, left, up = offset
     x = np.array(entry(config, "feet", "sole_x_m", count=2)) + ahead
@@ -158,8 +153,8 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     z = entry(config, "feet", "sole_z_m") + up
     half = (y[1] - y[0]) / 2 - abs(y[0] + y[1]) / 2  # the part that is symmetric about the ankle
     if not (x[0] < 0.0 < x[1] and half > 0 and z < 0):
-        raise RobotError(
-            f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
+        raise tree.error(
+            f"the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
             f"must lie below it and reach to both sides of it: the foot stands on its heel or its "
             f"toes with all joints at 0, or [feet] is wrong; give there the sole along the level "
             f"axes"
@@ -167,23 +162,21 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     return {"heel": float(x[0]), "toe": float(x[1]), "half": float(half), "z": float(z)}
 
 
-def _cut_hips(lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> Lumped:
-    """Hip ranges cut to where boxes of thigh and trunk meet; canted hips keep theirs."""
-    bodies = dict(lumped.bodies)
+def _cut_hips(lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> None:
+    """Cut hip ranges to where boxes of thigh and trunk meet; canted hips keep theirs."""
     cut = 0.0
     for hip, knee in zip(*(lumped.moved_by(roles[role]) for role in LEG[:2]), strict=True):
-        limits = dict(hip.limits)
         thigh = lumped.bodies[knee.parent]
         trunk = _solids(lumped.trunk, boxes, hip, 0.0)
         for end in ("lower", "upper") if abs(hip.axis[1]) == 1 else ():
-            grid = np.linspace(0.0, limits[end], max(int(abs(limits[end]) / STEP_RAD), 1) + 1)
-            gaps = [_gap(trunk, _solids(thigh, boxes, hip, angle)) for angle in grid]
-            if min(gaps) <= FREE_M:
-                limits[end] = float(grid[max(np.argmax(np.array(gaps) <= FREE_M) - 1, 0)])
-            cut = max(cut, abs(limits[end] - hip.limits[end]))
-        bodies[hip.name] = replace(hip, limits=limits)
-    changed = lumped.changed | ({"hip range cut, thigh meets trunk": (cut, "rad")} if cut else {})
-    return replace(lumped, bodies=bodies, changed=changed)
+            last = hip.limits[end]
+            grid = np.linspace(0.0, last, max(int(abs(last) / STEP_RAD), 1) + 1)
+            meets = [_gap(trunk, _solids(thigh, boxes, hip, x)) <= FREE_M for x in grid]
+            if any(meets):
+                hip.limits[end] = float(grid[max(meets.index(True) - 1, 0)])
+                cut = max(cut, abs(hip.limits[end] - last))
+    if cut:
+        lumped.changed["hip range cut, thigh meets trunk"] = (cut, "rad")
 
 
 def _solids(body: Body, boxes: dict[str, Boxes], joint: Body, angle: float) -> list[tuple]:
@@ -210,7 +203,7 @@ def _urdf(name: str, lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes])
     hip = np.mean([body.place for body in lumped.moved_by(roles["hip_pitch"])], axis=0)
     _add_trunk(robot, trunk, boxes[trunk.name], hip - trunk.place)
     for body in others:
-        _add_body(robot, body.name, body.inertia, boxes.get(body.name, []))
+        _add_body(robot, body.name, body.inertia, boxes[body.name])
         place = shifted(body.place - lumped.bodies[body.parent].place)
         limits = {key: body.limits[key] for key in LIMITS}
         ends = body.parent, body.name
@@ -223,8 +216,8 @@ def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
     """The table [published]: the robot with all its joints, fixed links as one."""
     trunk = lumped.trunk
     model = tree.model
-    joints = {k: tree.joints.get(name) for k, name in enumerate(model.names)}
-    moving = {k: joint for k, joint in joints.items() if joint and joint.kind in MOVING}
+    joints = [joint for joint in tree.joints.values() if joint.kind in MOVING]
+    moving = {model.getJointId(joint.name): joint for joint in joints}
     # what floats, and carries the trunk
     todo = [k for k in model.supports[tree.carrier[trunk.name]] if k not in moving][-1:]
     root = tree.bodies[tree.carrier[trunk.name]][0]
@@ -239,10 +232,9 @@ def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
             limits = ANY | joint.limits
             add_joint(robot, joint.name, kind, ends, model.jointPlacements[k], joint.axis, limits)
         todo += below
-        name = next((part for part in tree.bodies[carrier] if part in lumped.bodies), trunk.name)
-        axes = lumped.placed[link].inverse() * shifted(lumped.bodies[name].place)
-        shapes = boxes.get(name, []) if name in tree.bodies[carrier] else []
-        _add_body(robot, link, model.inertias[carrier], shapes, axes=axes)
+        own = next((part for part in tree.bodies[carrier] if part in boxes), None)
+        axes = lumped.placed[link].inverse() * shifted(lumped.bodies[own].place) if own else HERE
+        _add_body(robot, link, model.inertias[carrier], boxes.get(own, []), axes=axes)
     ET.indent(robot)
     place = shifted(-trunk.place) * lumped.placed[root]
     return filled(
@@ -281,7 +273,7 @@ def _add_trunk(robot: ET.Element, body: Body, boxes: Boxes, hip: np.ndarray) -> 
         spine.append((middle, np.array([size[0] / 2, size[1] / 2, bottom - hip[2]])))
     inertia = body.inertia
     matrix = inertia.inertia
-    if np.abs(matrix - np.diag(np.diag(matrix))).max() <= DIAGONAL:
+    if np.abs(np.triu(matrix, 1)).max() <= DIAGONAL:
         _add_body(robot, body.name, inertia, boxes, spine)
         return
     low, middle, high = np.linalg.eigvalsh(matrix)
@@ -332,10 +324,8 @@ def _boxes(
             foot = lumped.bodies[foot.parent]
             out.setdefault(foot.name, [])
     out |= _given_boxes(config, set(lumped.bodies))
-    for body in lumped.bodies.values():
-        if body.name not in out:
-            out[body.name] = _arm(lumped, body, width["arm"])
-    return out
+    arms = {b.name: _arm(lumped, b, width["arm"]) for b in lumped.bodies.values()}
+    return arms | out
 
 
 def _given_boxes(config: dict, links: set[str]) -> dict[str, Boxes]:
@@ -398,7 +388,7 @@ def _trunk_boxes(config: dict, leg: float, hip: np.ndarray) -> Boxes:
 def _toml(
     config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], urdf: str, lumped: Lumped
 ) -> str:
-    rest = {name: entry(config, "rest", name) for name in table(config, "rest")}
+    rest = numbers(config, "rest")
     if unknown := sorted(rest.keys() - {b.joint for b in lumped.bodies.values()}):
         raise RobotError(
             f"robot configuration: [rest] names the joint {unknown[0]!r}, which does not move"
@@ -406,11 +396,11 @@ def _toml(
     motors = ""
     for key in MOTOR:
         told = {b.joint: b.limits for b in lumped.bodies.values() if key in b.limits}
-        # speeds as shares of the speed limit
-        shares = {
-            joint: x[key] / (1.0 if key in OWN else x["velocity"]) for joint, x in told.items()
-        }
-        motors += titled(f"actuators.{RATIOS.get(key, key)}", shares)
+        if key in RATIOS:  # speeds as shares of the speed limit
+            values = {joint: x[key] / x["velocity"] for joint, x in told.items()}
+        else:
+            values = {joint: x[key] for joint, x in told.items()}
+        motors += titled(f"actuators.{RATIOS.get(key, key)}", values)
     return filled(
         "jumper.toml.in",
         name=entry(config, "name", kind=str),

@@ -19,7 +19,7 @@ from jumplab.robot.files import LEG, entry, table
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.roles import leg_joints, robot_axes
 from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Tree, link_poses, links_of
-from jumplab.robot_import.write import key, shifted
+from jumplab.robot_import.write import key, listed, shifted
 
 RoleJoints = dict[str, tuple[str, ...]]
 MIRROR = np.array([1.0, -1.0, 1.0])  # times a vector: its mirror image
@@ -100,10 +100,10 @@ def lump(
     (left, right) links of the soles.
     """
     trunk = source["trunk"]
-    for link in (trunk, *feet):
-        if link not in tree.elements:
-            what = f"the configuration names the link {link!r}, which the {tree.format} lacks"
-            raise tree.error(what)
+    if lost := [link for link in (trunk, *feet) if link not in tree.elements]:
+        raise tree.error(
+            f"the configuration names the link {lost[0]!r}, which the {tree.format} lacks"
+        )
     moving = _moving_joints(tree, config, roles, trunk, feet)
     held = _held_angles(tree, config, moving)
     model = tree.holding(held, moving)
@@ -169,7 +169,7 @@ def _moving_joints(
                 f"between {trunk!r} and {foot!r} come {', '.join(ordered)}; hip, "
                 f"knee and ankle must follow in this order; correct [joints]"
             )
-        return list(dict.fromkeys(moving + leg_joints(tree, trunk, feet)))
+    return list(dict.fromkeys(moving + leg_joints(tree, trunk, feet)))
 
 
 def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str, float]:
@@ -198,8 +198,8 @@ def _told_limits(tree: Tree, config: dict, roles: RoleJoints) -> dict[str, dict[
     for title in ("assumed", "limits"):
         for name, values in table(config, title).items():
             if name not in tree.joints and name not in roles:
-                dotted = next((j for j in tree.joints if j.startswith(f"{name}.")), None)
-                hint = f"; names with dots are quoted: [{title}.{key(dotted)}]" if dotted else ""
+                dotted = [key(j) for j in tree.joints if j.startswith(f"{name}.")]
+                hint = f"; names with dots are quoted: [{title}.{dotted[0]}]" if dotted else ""
                 raise tree.error(
                     f"[{title}.{key(name)}] names neither a joint of the {tree.format} nor a "
                     f"role{hint}"
@@ -231,11 +231,11 @@ def _limits(
     if sentence := _motor_fault(limits):
         raise tree.error(f"joint {joint!r}: {sentence}; correct [{where}]")
     own = tree.joints[joint].losses | limits
-    if sentence := _motor_fault(own):
-        used = len(own) - len(limits)
-        changed[f"joint {joint!r}: losses of the file not used, {sentence}"] = (used, "numbers")
-        return limits
-    return own
+    if not (sentence := _motor_fault(own)):
+        return own
+    used = len(own) - len(limits)
+    changed[f"joint {joint!r}: losses of the file not used, {sentence}"] = (used, "numbers")
+    return limits
 
 
 def _motor_fault(limits: dict[str, float]) -> str:
@@ -244,7 +244,8 @@ def _motor_fault(limits: dict[str, float]) -> str:
     effort = limits["effort"]
     free = limits.get(NO_LOAD, speed)
     corner = limits.get(CORNER, free / 2)
-    armature, friction, damping = (limits.get(part, 0.0) for part in OWN)
+    own = {part: limits.get(part, 0.0) for part in OWN}
+    armature, friction, damping = own.values()
     lost = friction + damping * speed
     if free < speed:
         return (
@@ -254,9 +255,8 @@ def _motor_fault(limits: dict[str, float]) -> str:
     if not 0 < corner < free:
         end = "no-load speed" if NO_LOAD in limits else "speed limit"
         return f"corner = {corner:g} rad/s must lie between 0 and the {end}, {free:g} rad/s"
-    for part in OWN:
-        if limits.get(part, 0.0) < 0:
-            return f"{part} = {limits[part]:g} must not be negative"
+    if negative := [f"{part} = {x:g}" for part, x in own.items() if x < 0]:
+        return f"{negative[0]} must not be negative"
     if armature > MOST_ARMATURE:
         return (
             f"armature = {armature:g} kg m^2 is more than {MOST_ARMATURE:g} kg m^2, that of no "
@@ -307,22 +307,21 @@ def _bodies(
         if name in feet and abs(axis[1]) == 1:
             middle = placed[name].translation[1] + (beside if name == feet[0] else -beside)
             place = np.array([place[0], middle, place[2]])
-        axes_of_body = shifted(-place) * data.oMi[carrier]
-        inertia = axes_of_body.act(model.inertias[carrier])
+        inertia = (shifted(-place) * data.oMi[carrier]).act(model.inertias[carrier])
         bodies.append(Body(name, parent, joint, place, axis, limits.get(joint, {}), inertia))
         names[carrier] = name
         for further in (j for j in tree.joints.values() if j.name in limits and j.name != joint):
             for near, far in permutations((further.parent, further.child)):
                 if carriers[near] == carrier:
                     todo.append((far, name, further.name))
+    links = {link: names[carrier] for link, carrier in carriers.items() if carrier in names}
     missing = tree.mass - sum(b.inertia.mass for b in bodies)
     if abs(missing) > 1e-9 * tree.mass:
-        lost = sorted(link for link, carrier in carriers.items() if carrier not in names)[:4]
+        lost = sorted(carriers.keys() - links)
         raise tree.error(
-            f"{missing:.3f} kg do not hang on the trunk "
-            f"({', '.join(map(repr, lost))}); they are joined to it by no joint of a robot"
+            f"{missing:.3f} kg do not hang on the trunk ({listed(lost)}); they are joined to it by "
+            f"no joint of a robot"
         )
-    links = {link: names[carrier] for link, carrier in carriers.items() if carrier in names}
     return bodies, links
 
 

@@ -23,13 +23,15 @@ from mujoco import mjtGain as GAIN
 from mujoco import mjtGeom as GEOM
 from mujoco import mjtJoint as JOINT
 from mujoco import mjtTrn as TRANSMISSION
+from mujoco import mjtWrap as WRAP
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed
+from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed, shifted
 
 ON_JOINT = [*map(int, (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPARENT))]
 # an activation of these is no larger than the control
 PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT))]
+LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
 UNNAMED = "MuJoCo Model"
 # names of files that say nothing of the robot in them
 GENERIC = re.compile(r"(?i)[ _-]*\b(scene|robot|model|main|mjcf|mjx)\b[ _-]*|^scene[ _-]")
@@ -63,23 +65,24 @@ def _spec(path: Path, text: str) -> mujoco.MjSpec:
     # MuJoCo would write its warnings into a file of the working folder
     mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
     try:
-        # MuJoCo reads only files that are called so
+        # MuJoCo reads only files that are called so; what they include may lie in other folders
         if path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64]):
             return mujoco.MjSpec.from_file(str(path))
-        spec = mujoco.MjSpec.from_string(text, include=dict(_included(path.parent, text)))
+        included = {name: inner.encode() for name, inner in _included(path.parent, text)}
+        spec = mujoco.MjSpec.from_string(text, include=included)
         spec.modelfiledir = f"{path.parent}/"
         return spec
     except (ValueError, mujoco.FatalError, OSError) as e:
         raise RobotError(f"{path.name}: MuJoCo cannot read this MJCF file: {_sentence(e)}") from e
 
 
-def _included(folder: Path, text: str) -> Iterator[tuple[str, bytes]]:
+def _included(folder: Path, text: str) -> Iterator[tuple[str, str]]:
     """Names and contents of the files that a text includes, and of those that they include."""
     for name in re.findall(r"<include\s[^>]*file\s*=\s*[\"']([^\"']+)", text):
         if (folder / name).is_file():
-            inner = (folder / name).read_bytes()
+            inner = (folder / name).read_text("utf-8", "replace")
             yield name, inner
-            yield from _included(folder, inner.decode("utf-8", "replace"))
+            yield from _included(folder, inner)
 
 
 def _sentence(e: Exception) -> str:
@@ -90,10 +93,8 @@ def _sentence(e: Exception) -> str:
 def _name(spec: mujoco.MjSpec, path: Path, text: str) -> str:
     """The robot's name: of the model, of a file that it includes, else of file or folder."""
     inner = [spec.modelname if spec.modelname != UNNAMED else ""]
-    for _, content in _included(path.parent, text):
-        inner += re.findall(
-            r"<mujoco\s[^>]*model\s*=\s*\"([^\"]+)", content.decode("utf-8", "replace")
-        )
+    for _, part in _included(path.parent, text):
+        inner += re.findall(r"<mujoco\s[^>]*model\s*=\s*\"([^\"]+)", part)
     names = (GENERIC.sub("", name) for name in (*inner, path.stem, path.resolve().parent.name))
     return next((name for name in names if name.strip(" _-")), path.stem)
 
@@ -106,7 +107,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
     files = sorted({x.file for x in (*spec.textures, *spec.hfields) if x.file})
     absent = [f for f in files if not any((path.parent / x / f).is_file() for x in folders)]
     if absent:
-        notes.append(f"the pictures {listed([*map(repr, absent)])} are not there: left out")
+        notes.append(f"the pictures {listed(absent)} are not there: left out")
     pictures = [*spec.textures, *spec.materials, *spec.skins, *spec.sensors, *spec.keys]
     terrain = [g for g in spec.geoms if int(g.type) == GEOM.mjGEOM_HFIELD]
     for part in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
@@ -152,7 +153,7 @@ def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: lis
             )
     names = {g.name for g in geoms if g.name}
     pairs = [pair for pair in spec.pairs if {pair.geomname1, pair.geomname2} & names]
-    bodies = sorted({repr(g.parent.name) for g in geoms})
+    bodies = sorted({g.parent.name for g in geoms})
     for part in [*pairs, *geoms, mesh]:
         spec.delete(part)
     where = f" of {listed(bodies)}" if bodies else ""
@@ -167,7 +168,7 @@ def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
     hinges = np.bincount(model.body_rootid[below], minlength=model.nbody)
     most = int(hinges.max())
     robots = [top for top in tops if hinges[top] == most]
-    names = listed([repr(model.body(top).name) for top in robots])
+    names = listed(model.body(top).name for top in robots)
     if not most:
         raise RobotError(f"{where}: no body hangs on another by a hinge; a robot needs legs")
     if len(robots) > 1:
@@ -175,8 +176,7 @@ def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
             f"{where}: the bodies {names} of the world have {most} hinges each below them, "
             f"{len(robots)} robots; take out all but one"
         )
-    others = [repr(model.body(top).name or f"body_{top}") for top in tops if top not in robots]
-    if others:
+    if others := [model.body(top).name or f"body_{top}" for top in tops if top not in robots]:
         notes.append(f"other bodies of the scene are left out: {listed(others)}")
     return robots[0]
 
@@ -221,12 +221,10 @@ class _Motors:
         k = model.actuator_trnid[a, 0]
         if kind not in ON_JOINT:
             self.others.append(model.actuator(a).name or f"actuator_{a}")
-            if kind == TRANSMISSION.mjTRN_TENDON:
-                first = model.tendon_adr[k]
-                parts = range(first, first + model.tendon_num[k])
-                fixed = model.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT
-                joints = [model.wrap_objid[i] for i in parts] if fixed else range(model.njnt)
-                self.pulled[model.jnt_dofadr[np.array(joints, int)]] = True
+            tendon = kind == TRANSMISSION.mjTRN_TENDON
+            if tendon and model.wrap_type[model.tendon_adr[k]] == WRAP.mjWRAP_JOINT:
+                parts = model.tendon_adr[k] + np.arange(model.tendon_num[k])
+                self.pulled[model.jnt_dofadr[model.wrap_objid[parts]]] = True
             elif kind != TRANSMISSION.mjTRN_BODY:
                 self.pulled[:] = True
             return
@@ -265,6 +263,8 @@ class _Writer:
         self.bodies = [i for i in range(1, model.nbody) if model.body_rootid[i] == root]
         self.names = {i: model.body(i).name or f"body_{i}" for i in self.bodies}
         self.joints = {}  # number of a joint -> names that it has got
+        # where joints count from [rad, m]: there bodies are as the file places them
+        self.ref = model.qpos0[model.jnt_qposadr] * (model.jnt_type != JOINT.mjJNT_BALL)
         paired = {*model.pair_geom1, *model.pair_geom2}
         self.touching = [
             bool(model.geom_contype[g] | model.geom_conaffinity[g]) or g in paired
@@ -305,7 +305,7 @@ class _Writer:
         model = self.model
         name = model.joint(k).name or f"{body}_joint_{k}"
         kind = model.jnt_type[k]
-        anchor = pin.SE3(np.eye(3), np.array(model.jnt_pos[k]))
+        anchor = shifted(model.jnt_pos[k])
         ball = kind == JOINT.mjJNT_BALL
         if ball:
             self.notes.append(f"the ball joint {name!r} is taken as hinges about x, y and z")
@@ -323,11 +323,6 @@ class _Writer:
             place = HERE
         return above, anchor.inverse()
 
-    def _ref(self, k: int) -> float:
-        """Where a joint counts from [rad, m]: there bodies are as the file places them."""
-        ball = self.model.jnt_type[k] == JOINT.mjJNT_BALL
-        return 0.0 if ball else float(self.model.qpos0[self.model.jnt_qposadr[k]])
-
     def _between(self, name: str) -> str:
         """A link without mass, of a name that no body has; its name."""
         while name in self.names.values():
@@ -341,9 +336,9 @@ class _Writer:
         dof = model.jnt_dofadr[k] + n
         limits = {}
         if model.jnt_limited[k]:
-            low, high = model.jnt_range[k]
+            low, high = model.jnt_range[k] - self.ref[k]
             ball = model.jnt_type[k] == JOINT.mjJNT_BALL
-            limits = {"lower": -high if ball else low - self._ref(k), "upper": high - self._ref(k)}
+            limits = {"lower": -high if ball else low, "upper": high}
         if (effort := self.motors.effort(dof)) is not None:
             limits["effort"] = effort
         losses = {
@@ -359,12 +354,11 @@ class _Writer:
         shape = add(link, "collision" if self.touching[g] else "visual")
         place = _place(model.geom_pos[g], model.geom_quat[g])
         radius, half, _ = model.geom_size[g]
-        kind = model.geom_type[g]
+        kind = int(model.geom_type[g])
         hull = model.mesh_graphadr[model.geom_dataid[g]] if kind == GEOM.mjGEOM_MESH else -1
         if kind == GEOM.mjGEOM_SPHERE:
             tag, sizes = "sphere", {"radius": radius}
-        elif kind == GEOM.mjGEOM_CAPSULE or kind == GEOM.mjGEOM_CYLINDER:
-            tag = "capsule" if kind == GEOM.mjGEOM_CAPSULE else "cylinder"
+        elif tag := LONG.get(kind):
             sizes = {"radius": radius, "length": 2 * half}
         elif hull >= 0:
             count = model.mesh_graph[hull]
@@ -373,7 +367,7 @@ class _Writer:
             tag, sizes = "mesh", {"vertex": model.mesh_vert[first + rows].astype(float).ravel()}
         else:
             middle, half_sizes = model.geom_aabb[g].reshape(2, 3)
-            place = place * pin.SE3(np.eye(3), np.array(middle))
+            place = place * shifted(middle)
             tag, sizes = "box", {"size": np.maximum(2 * half_sizes, 1e-6)}
         add_origin(shape, place)
         add(add(shape, "geometry"), tag, **sizes)
@@ -381,8 +375,7 @@ class _Writer:
     # what is between joints, and what is left out
     # ----------------------------------------------------------------------------------------------
     def _joints(self, numbers: Iterable[int]) -> str:
-        names = [repr(self.model.joint(int(k)).name or f"joint_{k}") for k in numbers]
-        return listed(names)
+        return listed(self.model.joint(int(k)).name or f"joint_{k}" for k in numbers)
 
     def add_equalities(self) -> None:
         """Joints that follow others, as mimics; what ties bodies is named."""
@@ -429,14 +422,15 @@ class _Writer:
     def note_what_is_left_out(self) -> None:
         """Springs, tendons, and actuators that act on no joint."""
         model = self.model
-        if counted := [k for k in self.joints if self._ref(k)]:
-            self.notes.append(f"the joints {self._joints(counted)} count from their ref, as 0")
-        springs = [k for k in self.joints if model.jnt_stiffness[k]]
-        if springs:
-            self.notes.append(f"the springs of the joints {self._joints(springs)} are left out")
-        tendons = [repr(model.tendon(t).name or t) for t in range(model.ntendon)]
-        if tendons:
-            self.notes.append(f"the tendons {listed(tendons)} are left out")
-        if self.motors.others:
-            names = listed([repr(name) for name in self.motors.others])
-            self.notes.append(f"the actuators {names} act on no joint: their torque is not counted")
+        counted = self._joints(k for k in self.joints if self.ref[k])
+        springs = self._joints(k for k in self.joints if model.jnt_stiffness[k])
+        tendons = listed(model.tendon(t).name or t for t in range(model.ntendon))
+        others = listed(self.motors.others)
+        for names, sentence in (
+            (counted, "the joints {} count from their ref, as 0"),
+            (springs, "the springs of the joints {} are left out"),
+            (tendons, "the tendons {} are left out"),
+            (others, "the actuators {} act on no joint: their torque is not counted"),
+        ):
+            if names:
+                self.notes.append(sentence.format(names))

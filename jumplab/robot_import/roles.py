@@ -101,8 +101,9 @@ class _Finder:
         self.tree = tree
         self.lateral = AXES[guess[:2]]
         self.up = AXES[guess[2:]]
-        self.at = {name: tree.pose[j.child].translation for name, j in tree.joints.items()}
-        self.axis = {name: tree.pose[j.child].rotation @ j.axis for name, j in tree.joints.items()}
+        poses = {joint: tree.pose[joint.child] for joint in tree.joints.values()}
+        self.at = {joint: pose.translation for joint, pose in poses.items()}
+        self.axis = {joint: pose.rotation @ joint.axis for joint, pose in poses.items()}
         self.tips = self._tips(every_kind)
         self.legs = self._legs()
 
@@ -111,12 +112,12 @@ class _Finder:
 
         def counts(j: Joint) -> bool:
             axis = j.kind == "fixed" and j.element.find("axis") is not None
-            return j.driven or (every_kind and (j.kind in (*MOVING, "planar") or axis))
+            return j.driven or (every_kind and (axis or j.kind in (*MOVING, "planar")))
 
         carrying = {joint.parent for joint in self.tree.joints.values()}
         ends = [link for link in self.tree.elements if link not in carrying]
-        chains = [[j for j in self.tree.chain(link) if counts(j)] for link in ends]
-        return [chain for chain in chains if chain]
+        chains = ([*filter(counts, self.tree.chain(link))] for link in ends)
+        return [*filter(None, chains)]
 
     def limbs(self) -> list[tuple[Chain, Chain]]:
         """Pairs of chains whose tips mirror each other across the plane between the hips, on the
@@ -127,9 +128,9 @@ class _Finder:
         chains = [chain for tip, chain in unique.items() if tip not in inner]
         out = []
         for a, b in combinations(chains, 2):
-            gap = self.at[b[-1].name] - self.at[a[-1].name]
+            gap = self.at[b[-1]] - self.at[a[-1]]
             side = float(gap @ self.lateral)
-            axis = self.axis[b[-1].name]  # an origin may lie anywhere on its axis
+            axis = self.axis[b[-1]]  # an origin may lie anywhere on its axis
             across = gap - side * self.lateral
             across = across - (across @ axis) * axis
             mirrored = abs(side) >= SAME_M >= norm(across)
@@ -141,7 +142,7 @@ class _Finder:
 
     def turning(self, joint: Joint) -> float:
         """Cosine [1] between a joint's axis and the lateral one."""
-        return abs(self.axis[joint.name] @ self.lateral)
+        return abs(self.axis[joint] @ self.lateral)
 
     def pitch(self, chain: Chain) -> Chain:
         """Joints of a chain about the lateral axis, more or less (by :data:`SWINGS`)."""
@@ -154,7 +155,7 @@ class _Finder:
         pitch = self.pitch(chain)
 
         def shorter(three: tuple[Joint, ...]) -> float:
-            flat = np.array([self.at[j.name] for j in three]) * (1 - np.abs(self.lateral))
+            flat = np.array([self.at[j] for j in three]) * (1 - np.abs(self.lateral))
             turning = np.prod([self.turning(j) for j in three])
             return turning * min(norm(np.diff(flat, axis=0), axis=1))
 
@@ -164,8 +165,8 @@ class _Finder:
         hip, knee, ankle = best
         at = self.at
         for joint in pitch[pitch.index(knee) + 1 : pitch.index(ankle)]:
-            shank = norm(at[joint.name] - at[knee.name])
-            foot = at[ankle.name] - at[joint.name]
+            shank = norm(at[joint] - at[knee])
+            foot = at[ankle] - at[joint]
             flat = abs(foot @ self.up) < norm(foot - (foot @ self.up) * self.up)
             if flat and 0 < norm(foot) < FOOT_LIKE * shank:
                 return hip, knee, joint
@@ -173,14 +174,14 @@ class _Finder:
 
     def leg_m(self) -> float:
         """Length of a leg from hip to ankle [m]."""
-        hip, _, ankle = (self.at[joint.name] for joint in self.legs[0][0])
+        hip, _, ankle = (self.at[joint] for joint in self.legs[0][0])
         return float(norm(hip - ankle))
 
     def along(self, three: tuple[Joint, ...]) -> bool:
         """True if the leg hangs (from hip to ankle), and ends where the robot does."""
         if not three:
             return False
-        hip, _, ankle = (self.at[joint.name] for joint in three)
+        hip, _, ankle = (self.at[joint] for joint in three)
         heights = np.array([*self.at.values()]) @ self.up
         tall = np.ptp(heights)
         low = ankle @ self.up < heights.min() + LOWEST * tall
@@ -191,15 +192,15 @@ class _Finder:
         """(hip, knee, ankle) and chain of both legs: the lowest mirrored pair; [] without any."""
         pairs = [[(self.triple(chain), chain) for chain in limb] for limb in self.limbs()]
         pairs = [pair for pair in pairs if self.along(pair[0][0]) and pair[1][0]]
-        return min(pairs, key=lambda pair: self.at[pair[0][0][2].name] @ self.up, default=[])
+        return min(pairs, key=lambda pair: self.at[pair[0][0][2]] @ self.up, default=[])
 
     def foot(self, three: tuple[Joint, ...], chain: Chain) -> str:
         """The link that stands: behind the ankle, before any toe joint (a further pitch joint)."""
-        _, knee, ankle = (self.at[joint.name] for joint in three)
+        _, knee, ankle = (self.at[joint] for joint in three)
         near = TOES * norm(ankle - knee)
 
         def of_ankle(joint: Joint) -> bool:
-            close = norm(self.at[joint.name] - ankle) < near
+            close = norm(self.at[joint] - ankle) < near
             return close and self.turning(joint) < SWINGS
 
         still = takewhile(of_ankle, chain[chain.index(three[2]) + 1 :])
@@ -217,7 +218,7 @@ class _Finder:
             x = around[:, 0]
             if not len(x):
                 x = [self.tree.pose[foot].rotation @ self.tree.body_of(foot).lever @ forward]
-            away = (self.tree.pose[foot].translation - self.at[three[2].name]) @ forward
+            away = (self.tree.pose[foot].translation - self.at[three[2]]) @ forward
             out.append(float((np.max(x) + np.min(x)) / 2 + away))
         return max(out)
 
@@ -229,7 +230,7 @@ class _Finder:
         for joint in joints:
             low, high = (joint.limits.get(end, 0.0) for end in ("lower", "upper"))
             real = max(abs(low), abs(high)) <= MOST_RAD
-            sums.append((low + high) * np.sign(self.axis[joint.name] @ left) * real)
+            sums.append((low + high) * np.sign(self.axis[joint] @ left) * real)
         mean = float(np.mean(sums)) if sums else 0.0
         return float(np.sign(mean)) * (abs(mean) >= EVEN_RAD)
 
@@ -305,11 +306,10 @@ def find_roles(tree: Tree) -> Roles:
         for role, pair in zip(ROLES, pairs, strict=True)
     }
     feet = tuple(finder.foot(*leg) for leg in finder.legs)[order]
-    toes = [j.name for foot in feet for j in tree.joints.values() if j.driven and tree.on(j, foot)]
-    if toes:
-        named = listed(map(repr, toes))
+    below = {link for foot in feet for link in tree.below(foot)}
+    if toes := [j.name for j in tree.joints.values() if j.driven and j.parent in below]:
         notes.append(
-            f"the joints {named} beyond the ankles are held, their links belong to the sole"
+            f"the joints {listed(toes)} beyond the ankles are held, their links belong to the sole"
         )
     if (reach := finder.ahead(forward)) < -BACKWARD_M:
         notes.append(
@@ -340,13 +340,14 @@ def _assumed(
     roles |= {name: role for role, pair in joints.items() for name in pair}
     out = {}
     for name, role in roles.items():
-        given = finder.tree.joints[name].limits
+        joint = finder.tree.joints[name]
         limits = {}
-        if not {"lower", "upper"} <= set(given):
+        if not {"lower", "upper"} <= set(joint.limits):
             low, high = ASSUMED_RAD[role]
-            ends = (low, high) if finder.axis[name] @ left > 0 else (0.0 - high, 0.0 - low)
-            limits |= zip(("lower", "upper"), ends, strict=True)
-        if role == "other" and MOST_RAD_S < given.get("velocity", 0.0) <= 2 * MOST_RAD_S:
+            turned = finder.axis[joint] @ left < 0
+            limits["lower"] = 0.0 - high if turned else low
+            limits["upper"] = 0.0 - low if turned else high
+        if role == "other" and MOST_RAD_S < joint.limits.get("velocity", 0.0) <= 2 * MOST_RAD_S:
             limits["velocity"] = MOST_RAD_S
         if limits:
             out[name] = limits
@@ -406,7 +407,8 @@ def _explain(tree: Tree) -> NoReturn:
 # ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Draft:
-    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found.
+    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found
+    in its ``tree``.
 
     ``faults`` are those of the limits of the joints that were found, one sentence each.
     """
@@ -414,18 +416,18 @@ class Draft:
     text: str
     roles: Roles
     sole: Sole
+    tree: Tree
     faults: tuple[str, ...]
 
 
-def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = None) -> Draft:
+def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     """Find the roles in a URDF and write the first TOML file for it, from ``starter.toml.in``;
     numbers that it lacks are asked for in comments. Raises :class:`RobotError`.
 
-    ``repair`` is what the person allows to be repaired, ``text`` what :func:`.urdf.read_urdf` has
-    read of the file, if it was read before.
+    ``repair`` is what the person allows to be repaired.
     """
     path = Path(path)
-    tree = read_tree(read_urdf(path) if text is None else text, path.name, path, repair)
+    tree = read_tree(read_urdf(path), path.name, path, repair)
     roles = find_roles(tree)
     turn = robot_axes(tree.pose[roles.trunk].rotation, roles.forward, roles.up)
     hip, _, ankle = (tree.pose[tree.joints[roles.joints[r][0]].child].translation for r in LEG)
@@ -465,8 +467,8 @@ def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = Non
         and f"\n# NEEDED: take away the # and put in the numbers [N m, rad/s, rad]\n{asked}",
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
-    roles = replace(roles, notes=(*notes(tree), *tree.notes, *roles.notes))
-    return Draft(config, roles, sole, tuple(faults))
+    roles = replace(roles, notes=(*notes(tree), *dict.fromkeys(tree.notes), *roles.notes))
+    return Draft(config, roles, sole, tree, tuple(faults))
 
 
 def jumping_joints(tree: Tree, roles: Roles) -> list[str]:

@@ -12,7 +12,6 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import cached_property
 from importlib import import_module, metadata
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -63,7 +62,6 @@ FRAME_KG = 5e-4  # lighter links are frames, whose tensor nobody measured; it is
 TRIANGLE = 1e-3
 # radius of gyration of the whole robot: a link's tensor that is wrong by less is mended with a note
 LEFTOVER_M = 0.01
-ROUND = ("sphere", "capsule", "cylinder")
 MOST_MESH_M = 5.0  # no link is longer: a larger mesh is in millimetres
 # share of the largest second moment that a repaired inertia keeps: a plate, width over thickness 30
 THINNEST = 1e-3
@@ -317,6 +315,7 @@ class Tree:
         self, root: ET.Element, where: str, path: Path | None = None, repair_inertia: bool = False
     ):
         self.xml = root
+        self.text = ""
         self.format = root.get("format", "URDF")
         self.where = where
         self.notes = []  # on files that were read on the way
@@ -352,7 +351,10 @@ class Tree:
             self.model.addFrame(pin.Frame(link, carrier, 0, place, pin.FrameType.BODY))
             below = [j for j in self.joints.values() if j.parent == link]
             todo += [(j.child, carrier, place * j.place, j.name, j.kind, j.axis) for j in below]
+        data = self.model.createData()
         self.mass = pin.computeTotalMass(self.model)
+        pin.computeSubtreeMasses(self.model, data)
+        self._masses = list(data.mass)
         self.pose = link_poses(self.model)
 
     def error(self, text: str) -> RobotError:
@@ -363,15 +365,9 @@ class Tree:
         """Inertia of a link and all fixed to it, in their joint's frame [kg, m, kg m^2]."""
         return self.model.inertias[self.carrier[link]]
 
-    @cached_property
-    def _carried(self) -> list[float]:
-        data = self.model.createData()
-        pin.computeSubtreeMasses(self.model, data)
-        return list(data.mass)
-
     def carried(self, link: str) -> float:
         """Mass of the body of a link and of all that hangs on it [kg]."""
-        return self._carried[self.carrier[link]]
+        return self._masses[self.carrier[link]]
 
     def holding(self, held: Mapping[str, float], moving: Collection[str]) -> pin.Model:
         """Pinocchio's model whose other joints do not move: they are ``held`` [rad, m], else at 0.
@@ -405,7 +401,7 @@ class Tree:
             (_place(e), shape)
             for e in self.elements[link].findall(kind)
             for shape in e.findall("geometry/*")
-            if shape.tag == "mesh" or faultless(shape)
+            if shape.tag == "mesh" or _sizes(shape)
         ]
 
     def corners(self, shape: ET.Element) -> np.ndarray:
@@ -413,7 +409,7 @@ class Tree:
         if shape.get("vertex"):  # of an MJCF
             return np.array(shape.get("vertex").split(), float).reshape(-1, 3)
         if shape.tag != "mesh":
-            return _box_around(shape)
+            return box_corners(SHAPES[shape.tag](*_sizes(shape)))
         mesh = self._mesh(shape)
         return np.array(mesh.vertices()) if mesh else np.zeros((0, 3))
 
@@ -422,10 +418,6 @@ class Tree:
         carrier = self.carrier[link]
         hanging = [c for c in self.bodies if c == carrier or carrier in self.model.supports[c]]
         return [part for c in hanging for part in self.bodies[c]]
-
-    def on(self, joint: Joint, link: str) -> bool:
-        """Whether a joint hangs on a link, or on what that carries."""
-        return joint.parent in self.below(link)
 
     def meshes(self, link: str) -> list[tuple[np.ndarray, np.ndarray]]:
         """Points (n, 3) in a link's frame, triangles (m, 3) of the meshes that are found."""
@@ -452,8 +444,7 @@ class Tree:
         try:
             mesh = loader.load(str(file), scale)
             if np.abs(mesh.vertices()).max(initial=0.0) > MOST_MESH_M:
-                note = f"the mesh {inside!r} is taken in millimetres"
-                self.notes += [note] if note not in self.notes else []
+                self.notes.append(f"the mesh {inside!r} is taken in millimetres")
                 mesh = loader.load(str(file), scale / 1000)
             return mesh
         # a pointer to a mesh that was not downloaded, or a format of its own
@@ -474,14 +465,8 @@ def link_poses(model: pin.Model) -> dict[str, pin.SE3]:
     return {name: data.oMf[i].copy() for name, i in links_of(model).items()}
 
 
-def faultless(shape: ET.Element) -> bool:
-    """Whether a shape is known, and its sizes are positive numbers."""
+def _sizes(shape: ET.Element) -> list[float]:
+    """Sizes of a shape [m]; [] if it is not known, or they are not positive numbers."""
     sizes = [numbers(shape.get(key), count) for key, count in SIZES.get(shape.tag, {}).items()]
-    return bool(sizes) and all(x is not None and np.all(x >= 0) for x in sizes)
-
-
-def _box_around(shape: ET.Element) -> np.ndarray:
-    """(8, 3) corners of the box around a shape, in its own frame [m]."""
-    sizes = (numbers(shape.get(key), count) for key, count in SIZES[shape.tag].items())
-    geometry = SHAPES[shape.tag](*np.concatenate([*sizes]))
-    return box_corners(geometry)
+    good = all(x is not None and np.all(x >= 0) for x in sizes)
+    return [*np.concatenate(sizes)] if sizes and good else []

@@ -94,11 +94,11 @@ def quote(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def listed(names: Iterable[str]) -> str:
-    """Names for a sentence, the first of many."""
-    names = list(names)
-    more = len(names) - MOST_NAMES
-    return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+def listed(names: Iterable[Any]) -> str:
+    """Names, or numbers, in quotes for a sentence, the first of many."""
+    quoted = [*map(repr, names)]
+    more = len(quoted) - MOST_NAMES
+    return ", ".join(quoted[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def key(name: str) -> str:

@@ -138,14 +138,13 @@ def _published(robot: Robot) -> tuple[list[Part], list[str]]:
         like = examine(SHIPPED[robot.name])
     except (KeyError, RobotError):
         return [], ["drawn from boxes: its meshes are not known on this machine"]
-    jumper = like.jumper
-    if origin[1] not in jumper.config_text or like.robot.joint_names != robot.joint_names:
+    if origin[1] not in like.robot.config_text or like.robot.joint_names != robot.joint_names:
         return [], ["drawn from boxes: its meshes here are those of another version"]
     parts = []
-    for link, body in jumper.lumped.links.items():
-        place = jumper.lumped.place(link)
+    for link, body in like.lumped.links.items():
+        place = like.lumped.place(link)
         joint = robot.model.frames[robot.model.getFrameId(body, pin.FrameType.BODY)].parentJoint
-        for points, triangles in jumper.tree.meshes(link):
+        for points, triangles in like.tree.meshes(link):
             moved = points @ place.rotation.T + place.translation
             parts.append(Part(joint, _kind(robot, joint), moved, triangles, True))
     if not parts:

@@ -71,7 +71,7 @@ def imported(path: Path, legs: list[list[str]]) -> tuple[Robot | None, dict[str,
         return None, row
     robot = result.robot
     told = {"kg": round(robot.total_mass, 2), "planner": "planar" if robot.planar else "spatial"}
-    return robot, row | told | {"held": len(result.jumper.tree.joints) - len(robot.joint_names)}
+    return robot, row | told | {"held": len(result.tree.joints) - len(robot.joint_names)}
 
 
 def leg_m(robot: Robot) -> float:
