@@ -1,5 +1,6 @@
-"""What the commands share: how their options are read, the modules they load late, and what is
-printed of a result.
+"""What the commands share: how their options are read, and what is printed of a result.
+
+Help and refusals do not wait for the heavy libraries: ``jl`` and the sub-packages load them late.
 """
 
 import argparse
@@ -9,36 +10,18 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import jumplab as jl
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.io.files import ensure_writable
 from jumplab.sim import DEFAULT_ENGINE, ENGINES
 
 # the value of an option, from its name and its text; raises InputError
 Kind = Callable[[str, str], Any]
 Work = Callable[[argparse.Namespace], None]
 MOST_VALUES = 10_000
-
-
-class Late:
-    """A module that is imported when it is first used: help and refusals need not wait for the
-    heavy libraries.
-    """
-
-    def __init__(self, name: str):
-        self._name = f"jumplab.{name}"
-
-    def __getattr__(self, attribute: str) -> Any:
-        return getattr(import_module(self._name), attribute)
-
-
-store = Late("io.folder")
-robots = Late("robot")
-pages = Late("show.viewer")
-tables = Late("show.tables")
-style = Late("show.style")
 
 
 # what options take ------------------------------------------------------------------------------
@@ -89,6 +72,7 @@ def values_of(option: str, text: str) -> list[float]:
 
 
 VALUES = "FROM:TO:COUNT or A,B,..."
+folder = needing("name a folder", str.strip)
 KINDS = {
     "number": number,
     "number or never": lambda option, text: None if text == "never" else number(option, text),
@@ -96,7 +80,9 @@ KINDS = {
     "whole": whole,
     "values": values_of,
     "values in degrees": lambda option, text: [math.radians(x) for x in values_of(option, text)],
-    "folder": needing("name a folder", str.strip),
+    "robot": lambda option, text: jl.Robot.load(text),
+    "folder": folder,
+    "writable": lambda option, text: ensure_writable(folder(option, text)) and text,
     "file": needing(
         "name a file in a folder that exists",
         lambda text: (

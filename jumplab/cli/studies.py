@@ -9,18 +9,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jumplab import sim, studies
+import jumplab as jl
+from jumplab import io, sim, studies
 from jumplab.cli.common import (
-    Late,
     disturbances,
     given,
     named,
-    pages,
     resumable,
-    robots,
-    store,
-    style,
-    tables,
     values_of,
     without,
 )
@@ -28,10 +23,6 @@ from jumplab.cli.notebooks import paper
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.io.progress import tell
 from jumplab.task import JumpTask
-
-api = Late("api")
-certificate_pages = Late("show.certificate")
-pictures = Late("show.maps")
 
 TARGET = "distance_m", "height_m", "platform_m", "side_m", "yaw_rad", "gravity"
 CAPTION = "Cells with a plan of the direct planner, coloured by the limit of which they use most."
@@ -64,12 +55,12 @@ def trials(args: Namespace) -> None:
     args.found |= data | {"resumed": report.resumed}
     for what, condition in report.conditions.items():
         print(f"{what}: {condition}")
-    print(tables.table(report.rows()))
+    print(jl.plots.table(report.rows()))
     measured = data.get("landed_metrics", {}).items()
     asked = report.target | {key: report.target[name] for key, name in ASKED.items()}
     lengths = [{"of the landed": key, "asked": asked[key]} | x for key, x in measured if x]
     if lengths:
-        print(tables.table(lengths))
+        print(jl.plots.table(lengths))
     print(report.line())
     name = "basin" if args.basin else "trials"
     print(f"{name}.json in {args.dir}, {report.resumed} trials from an earlier run")
@@ -87,7 +78,7 @@ def margins(args: Namespace) -> None:
     with resumable():
         report = work(args.dir, **options)
     args.found |= report.to_json()
-    print(tables.table([margin.row() for margin in report.margins], digits=3))
+    print(jl.plots.table([margin.row() for margin in report.margins], digits=3))
     print(f"{report.line()}; margins.json in {args.dir}")
 
 
@@ -95,7 +86,7 @@ def certify(args: Namespace) -> None:
     """Do two physics agree on a plan? Audit, both engines, two modes, both contacts."""
 
     def page(certificate: Any) -> str:
-        return certificate_pages.certificate_page(certificate).html
+        return jl.plots.certificate_page(certificate).html
 
     options = given(studies.certify.certify, args, seed=args.seed or 0, page=page)
     with resumable():
@@ -103,7 +94,7 @@ def certify(args: Namespace) -> None:
     args.found |= certificate.to_json()
     for mode in certificate.modes:
         print(f"{mode.mode} mode")
-        print(tables.table([d.row() for d in mode.differences], digits=3))
+        print(jl.plots.table([d.row() for d in mode.differences], digits=3))
         landed = ", ".join(f"{count} in {name}" for name, count in mode.landed.items())
         print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
     for engine, trial in certificate.usual.items():
@@ -125,8 +116,7 @@ def certify(args: Namespace) -> None:
 
 def clips(args: Namespace) -> None:
     """Thirty jumps to all sides, planned, audited, landed alike in both engines, as clips."""
-    robot = robots.Robot.load(args.robot)
-    options = given(studies.clips.make_clips, args, robot=robot, format_name=args.format, say=print)
+    options = given(studies.clips.make_clips, args, format_name=args.format, say=print)
     with resumable("clips"):
         library = studies.clips.make_clips(**options)
     args.found |= {"out": args.out} | library
@@ -135,7 +125,7 @@ def clips(args: Namespace) -> None:
     print(f"{passed} of {count} clips passed; index.json in {args.out}")
     if not passed:
         reason = library["left_out"][0]["reasons"][0]
-        raise InfeasibleError(f"no clip of {robot.name} passed: {reason}")
+        raise InfeasibleError(f"no clip of {args.robot.name} passed: {reason}")
 
 
 def chain(args: Namespace) -> None:
@@ -150,21 +140,19 @@ def chain(args: Namespace) -> None:
             )
     axes = (args.distance_m, args.height_m, args.platform_m, args.side_m, args.yaw_rad)
     course = studies.chain.Course.of(*axes)
-    robot = robots.Robot.load(args.robot)
-    store.ensure_writable(args.out)
     ranges = studies.chain.RANGES[args.ranges or "slight"]
     seed = args.seed or 0
     drawn = None
     if args.seed is not None or args.runs > 1:
-        drawn = sim.Perturbation.draw(robot, seed, ranges)
-    options = given(studies.chain.run_chain, args, course=course, robot=robot)
+        drawn = sim.Perturbation.draw(args.robot, seed, ranges)
+    options = given(studies.chain.run_chain, args, course=course)
     result = studies.chain.run_chain(**options, perturbation=drawn)
     series = None
     if args.runs > 1:
         options |= {"n": args.runs, "seed": seed, "ranges": ranges, "jobs": args.jobs}
         series = studies.chain.run_chains(**options)
     where = {"scene": result.scene, "marks_m": course.goals_m}
-    page = pages.page(result.robot, simulation=result, title="A chain of jumps", **where)
+    page = jl.plots.page(result.robot, simulation=result, title="A chain of jumps", **where)
     audits = studies.chain.write_chain(args.out, result, {"chain.html": page.html}, series=series)
     args.found |= {"out": args.out} | result.to_json() | {"series": series}
     _print_chain(result, series)
@@ -196,7 +184,7 @@ SERIES_COLUMNS = {
 
 def _print_chain(result: Any, series: dict[str, Any] | None) -> None:
     """Jump by jump, then the verdict; how the perturbed robots fared, if there are any."""
-    print(tables.table(result.rows(), CHAIN_COLUMNS, decimals=3))
+    print(jl.plots.table(result.rows(), CHAIN_COLUMNS, decimals=3))
     ready = f"{result.in_time} of {len(result.replans)}"
     print(f"plans made on the way: {ready} were there when the robot was ready for them")
     print("chain: stands after every jump" if result.stood else f"chain: FAILED, {result.reason}")
@@ -204,7 +192,7 @@ def _print_chain(result: Any, series: dict[str, Any] | None) -> None:
         return
     low, high = series["interval"]
     row = series | {"interval": f"{low:.1%} ... {high:.1%}"}
-    print(tables.table([row], SERIES_COLUMNS, digits=3))
+    print(jl.plots.table([row], SERIES_COLUMNS, digits=3))
     for trial in series["trials"]:
         if not trial["stood"]:
             print("  seed {seed}: {reason}".format_map(trial))
@@ -218,8 +206,6 @@ def envelope(args: Namespace) -> None:
         raise InputError(
             f"a map of sides has one height, got {len(args.height_m)}; give --height-m one number"
         )
-    robot = robots.Robot.load(args.robot)
-    store.ensure_writable(args.out)
     axes = "distance_m", "height_m"
     fixed = None
     if args.side_m is not None:
@@ -231,35 +217,32 @@ def envelope(args: Namespace) -> None:
     if across is not args.distance_m:
         without(args, "holds jumps straight ahead", atlas=None)
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
-    options = given(studies.envelope.envelope, args, robot=robot, folder=args.out, atlas=atlas)
+    options = given(studies.envelope.envelope, args, folder=args.out, atlas=atlas)
     options |= {"distances": across, "heights": up, "axes": axes, "fixed": fixed}
     envelope = studies.envelope.envelope(**options)
-    figure = pictures.envelope_map(envelope)
-    args.found["map"] = asdict(envelope) | {"hash": robot.hash}
-    store.settle()
-    text = store.to_json(args.found["map"])
-    store.write_file(Path(args.out, "envelope.json"), text.encode())
-    style.save_figure(figure, "envelope", args.out, CAPTION, robot=robot)
+    figure = jl.plots.envelope_map(envelope)
+    args.found["map"] = asdict(envelope) | {"hash": args.robot.hash}
+    io.folder.settle()
+    text = io.folder.to_json(args.found["map"])
+    io.folder.write_file(Path(args.out, "envelope.json"), text.encode())
+    jl.plots.save_figure(figure, "envelope", args.out, CAPTION, robot=args.robot)
     solved = sum(c.solved for c in envelope.cells)
     print(f"map in {args.out}: {solved} of {len(envelope.cells)} cells have a plan")
     if not solved:
         reason = next((c.reason for c in envelope.cells if c.reason), "no cell has a plan")
-        raise InfeasibleError(f"{robot.name} can do none of these jumps: {reason}")
+        raise InfeasibleError(f"{args.robot.name} can do none of these jumps: {reason}")
     for word, cell in (("highest", envelope.highest), ("farthest", envelope.farthest)):
-        jump = style.describe_task(cell.task)
+        jump = jl.plots.describe_task(cell.task)
         print(f"{word}: {jump}, limited by {cell.limiting} ({100 * cell.share:.0f} % used)")
 
 
 def record(args: Namespace) -> None:
     """How far a robot can go in one number of the target, what ends it, what more would buy."""
-    robot = robots.Robot.load(args.robot)
     numbers = {name: getattr(args, name) for name in TARGET if getattr(args, name) is not None}
     task = None
     if numbers:
         task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers)
-    if args.out:
-        store.ensure_writable(args.out)
-    options = given(studies.record.record, args, robot=robot, given=task)
+    options = given(studies.record.record, args, given=task)
     found = studies.record.record(**options)
     args.found["record"] = {"what": found.what, "value": found.value, "unit": found.unit}
     if math.isfinite(found.bound):
@@ -271,37 +254,37 @@ def record(args: Namespace) -> None:
     for name, run in found.runs.items():
         print(f"at {found.share:.0%} of it in {name}: {run.line()}")
     columns = ("limit", "joint", "phase", "from_s", "to_s", "worth")
-    print(tables.table([asdict(x) for x in found.limits], columns, digits=3))
+    print(jl.plots.table([asdict(x) for x in found.limits], columns, digits=3))
     if args.prices:
         prices = found.prices()
         args.found["prices"] = [asdict(row) for row in prices.rows]
-        print(tables.table([asdict(row) | {"gap": row.gap} for row in prices.rows], digits=3))
+        print(jl.plots.table([asdict(row) | {"gap": row.gap} for row in prices.rows], digits=3))
         print(prices.line())
     if args.improve:
         better = found.improve({"gear": args.improve.split(",")})
         args.found["improved"] = {"changes": [asdict(x) for x in better.changes]}
         args.found["improved"]["value"] = better.after.value
         print(better.line())
-        print(tables.table([asdict(x) for x in better.changes], digits=3))
+        print(jl.plots.table([asdict(x) for x in better.changes], digits=3))
         found = better.after
     if args.out:
-        api.save(args.out, found.plan)
+        jl.save(args.out, found.plan)
         print(f"the plan at the record is in {args.out}")
 
 
 def atlas(args: Namespace) -> None:
     """Plan a grid once: any target between its nodes is then a few steps away."""
-    robot = robots.Robot.load(args.robot)
-    store.ensure_writable(args.out)
     axes = {"distances": args.distance_m, "heights": args.height_m}
     build = studies.atlas.Atlas.build
-    options = given(build, args, robot=robot, folder=args.out, **axes)
+    options = given(build, args, folder=args.out, **axes)
     with resumable("nodes"):
         built = build(**options)
     count = math.prod(map(len, axes.values()))
     args.found |= {"out": args.out, "planned": len(built.nodes), "of": count}
     if not built.nodes:
-        raise InfeasibleError(f"{robot.name} can do none of these jumps; see 'jumplab envelope'")
+        raise InfeasibleError(
+            f"{args.robot.name} can do none of these jumps; see 'jumplab envelope'"
+        )
     print(f"{built} in {args.out}; 'jumplab plan --atlas {args.out}' begins with it")
 
 
@@ -346,8 +329,8 @@ def bench(args: Namespace) -> None:
     benchmark = paper("planning_times")
     times = benchmark.bench(args.robot, task, args.repeats, say=tell)
     args.found |= times
-    print(tables.table(times["rows"], benchmark.COLUMNS, digits=3))
+    print(jl.plots.table(times["rows"], benchmark.COLUMNS, digits=3))
     if args.out is not None:
-        store.settle()
-        store.write_file(args.out, json.dumps(times, indent=1).encode())
+        io.folder.settle()
+        io.folder.write_file(args.out, json.dumps(times, indent=1).encode())
         print(f"raw times in {args.out}")
