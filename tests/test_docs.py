@@ -14,7 +14,6 @@ from jumplab.cli import main as command_line
 from jumplab.cli import notebooks
 from jumplab.sim import Ranges
 from jumplab.stages import joint_qp, srmp, whole_body
-from jumplab.studies.trials import OLDER
 from jumplab.task import FRICTION
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -256,7 +255,6 @@ def test_prose_is_plain():
         for where, text in prose()
         for kind, pattern in NEVER.items()
         for match in re.finditer(pattern, text, re.M)
-        if text not in OLDER  # which logs of earlier versions have
     ]
     assert not found, "\n".join(found)
 

@@ -1,14 +1,11 @@
 """The command ``jumplab robot``: which robots there are, and whether a URDF is one."""
 
-import hashlib
 from argparse import Namespace
 from pathlib import Path
 
 import jumplab as jl
 from jumplab import io
 from jumplab.errors import InputError, JumplabError, RobotError
-
-MARK = b"# unless edited, the sum of what is above: "
 
 
 def list_(args: Namespace) -> None:
@@ -125,24 +122,21 @@ def _draft(urdf: str, text: str, repair: tuple[str, ...], out: str | None, force
 
 
 def _write(folder: Path, text: str, force: bool) -> Path:
-    """Write a starter configuration, but not over one that somebody has edited; its path."""
+    """Write a starter configuration, but not over another one, which somebody may have edited; its
+    path.
+    """
     from jumplab.robot import files
 
     path = folder / f"{files.read_toml(text, 'starter')['name']}.toml"
-    if path.exists() and not force and path.read_bytes() != _marked(path.read_bytes()):
+    content = text.encode()
+    if path.exists() and not force and path.read_bytes() != content:
         raise InputError(
             f"{path}: has been edited; choose another --out, or overwrite it with --force"
         )
     try:
-        io.folder.write_file(path, _marked(text.encode()))
+        io.folder.write_file(path, content)
     except InputError as e:
         reason = getattr(e.__cause__, "strerror", e)
         raise InputError(f"{path}: cannot be written ({reason})") from e
     print(f"starter configuration: {path}")
     return path
-
-
-def _marked(text: bytes) -> bytes:
-    """A configuration with a last line that tells whether it is still as it was written."""
-    content = text.rpartition(MARK)[0] or text
-    return content + MARK + hashlib.sha256(content).hexdigest()[:12].encode() + b"\n"

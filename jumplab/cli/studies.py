@@ -15,7 +15,7 @@ from jumplab.cli.common import (
     disturbances,
     given,
     named,
-    resumable,
+    resumed,
     values_of,
     without,
 )
@@ -32,25 +32,19 @@ ASKED = {"foot_distance_m": "distance_m", "com_rise_m": "height_m"}  # metrics b
 def trials(args: Namespace) -> None:
     """Let many perturbed robots jump a plan."""
     if args.basin:
-        if args.seed is not None:
-            raise InputError(
-                "--seed says which robots are drawn, and --basin draws none; leave one of them away"
-            )
-        without(
-            args, "is for robots that are drawn, and --basin draws none", disturb=[], keep_falls=0
-        )
+        why = "is for robots that are drawn, and --basin draws none"
+        without(args, why, seed=None, disturb=[], keep_falls=0)
         without(
             args, "acts in launch, and the basin's states are those of a flight", feedback=False
         )
     ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    settings = _settings(args, noise=noise, ranges=ranges)
-    work = paper("basin").landing_basin if args.basin else studies.trials.run_trials
-    options = given(work, args, settings=settings)
-    if not args.basin:  # 200: a success rate near 95 % is then known to 3 % on either side
+    options = {"folder": args.dir, "settings": _settings(args, noise=noise, ranges=ranges)}
+    if args.basin:
+        report = resumed(paper("basin").landing_basin, args, **options)
+    else:  # 200: a success rate near 95 % is then known to 3 % on either side
         options |= {"n": args.n or 200, "seed": args.seed or 0}
-    with resumable():
-        report = work(args.dir, **options)
+        report = resumed(studies.trials.run_trials, args, **options)
     data = report.to_json()
     args.found |= data | {"resumed": report.resumed}
     for what, condition in report.conditions.items():
@@ -73,10 +67,8 @@ def _settings(args: Namespace, **more: Any) -> Any:
 def margins(args: Namespace) -> None:
     """The largest size of each disturbance that a plan tolerates."""
     names = args.disturb or (*studies.margins.SINGLE, *studies.margins.PAIRS)
-    work = studies.margins.margins
-    options = given(work, args, names=names, seed=args.seed or 0, settings=_settings(args))
-    with resumable():
-        report = work(args.dir, **options)
+    options = {"folder": args.dir, "seed": args.seed or 0, "settings": _settings(args)}
+    report = resumed(studies.margins.margins, args, names=names, **options)
     args.found |= report.to_json()
     print(jl.plots.table([margin.row() for margin in report.margins], digits=3))
     print(f"{report.line()}; margins.json in {args.dir}")
@@ -88,13 +80,12 @@ def certify(args: Namespace) -> None:
     def page(certificate: Any) -> str:
         return jl.plots.certificate_page(certificate).html
 
-    options = given(studies.certify.certify, args, seed=args.seed or 0, page=page)
-    with resumable():
-        certificate = studies.certify.certify(args.dir, **options)
+    options = {"folder": args.dir, "seed": args.seed or 0, "page": page}
+    certificate = resumed(studies.certify.certify, args, **options)
     args.found |= certificate.to_json()
     for mode in certificate.modes:
         print(f"{mode.mode} mode")
-        print(jl.plots.table([d.row() for d in mode.differences], digits=3))
+        print(jl.plots.table(mode.differences, studies.certify.COLUMNS, digits=3))
         landed = ", ".join(f"{count} in {name}" for name, count in mode.landed.items())
         print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
     for engine, trial in certificate.usual.items():
@@ -116,9 +107,8 @@ def certify(args: Namespace) -> None:
 
 def clips(args: Namespace) -> None:
     """Thirty jumps to all sides, planned, audited, landed alike in both engines, as clips."""
-    options = given(studies.clips.make_clips, args, format_name=args.format, say=print)
-    with resumable("clips"):
-        library = studies.clips.make_clips(**options)
+    options = {"format_name": args.format, "say": print}
+    library = resumed(studies.clips.make_clips, args, "clips", **options)
     args.found |= {"out": args.out} | library
     passed = len(library["clips"])
     count = passed + len(library["left_out"])
@@ -239,33 +229,30 @@ def envelope(args: Namespace) -> None:
 def record(args: Namespace) -> None:
     """How far a robot can go in one number of the target, what ends it, what more would buy."""
     numbers = {name: getattr(args, name) for name in TARGET if getattr(args, name) is not None}
-    task = None
-    if numbers:
-        task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers)
+    task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers) if numbers else None
     options = given(studies.record.record, args, given=task)
     found = studies.record.record(**options)
-    args.found["record"] = {"what": found.what, "value": found.value, "unit": found.unit}
-    if math.isfinite(found.bound):
-        args.found["record"]["bound"] = found.bound
-    args.found["record"] |= {"found": found.found, "limits": [asdict(x) for x in found.limits]}
-    args.found["record"]["landed"] = {name: run.landed for name, run in found.runs.items()}
+    limits = [asdict(x) for x in found.limits]
+    told = {name: getattr(found, name) for name in ("what", "value", "unit", "bound", "found")}
+    landed = {name: run.landed for name, run in found.runs.items()}
+    args.found["record"] = told | {"limits": limits, "landed": landed}
     print(found.line())
     print(f"audit: {found.audit.line()}")
     for name, run in found.runs.items():
         print(f"at {found.share:.0%} of it in {name}: {run.line()}")
     columns = ("limit", "joint", "phase", "from_s", "to_s", "worth")
-    print(jl.plots.table([asdict(x) for x in found.limits], columns, digits=3))
+    print(jl.plots.table(limits, columns, digits=3))
     if args.prices:
         prices = found.prices()
-        args.found["prices"] = [asdict(row) for row in prices.rows]
-        print(jl.plots.table([asdict(row) | {"gap": row.gap} for row in prices.rows], digits=3))
+        args.found["prices"] = [asdict(row) | {"gap": row.gap} for row in prices.rows]
+        print(jl.plots.table(args.found["prices"], digits=3))
         print(prices.line())
     if args.improve:
         better = found.improve({"gear": args.improve.split(",")})
-        args.found["improved"] = {"changes": [asdict(x) for x in better.changes]}
-        args.found["improved"]["value"] = better.after.value
+        changes = [asdict(x) for x in better.changes]
+        args.found["improved"] = {"changes": changes, "value": better.after.value}
         print(better.line())
-        print(jl.plots.table([asdict(x) for x in better.changes], digits=3))
+        print(jl.plots.table(changes, digits=3))
         found = better.after
     if args.out:
         jl.save(args.out, found.plan)
@@ -275,10 +262,7 @@ def record(args: Namespace) -> None:
 def atlas(args: Namespace) -> None:
     """Plan a grid once: any target between its nodes is then a few steps away."""
     axes = {"distances": args.distance_m, "heights": args.height_m}
-    build = studies.atlas.Atlas.build
-    options = given(build, args, folder=args.out, **axes)
-    with resumable("nodes"):
-        built = build(**options)
+    built = resumed(studies.atlas.Atlas.build, args, "nodes", folder=args.out, **axes)
     count = math.prod(map(len, axes.values()))
     args.found |= {"out": args.out, "planned": len(built.nodes), "of": count}
     if not built.nodes:
@@ -312,8 +296,7 @@ def sweep(args: Namespace) -> None:
         args.robot or ["bhr"], choices_of("--vary must be WHAT", args.vary)
     )
     cases = studies.sweep.grid(*axes, robots=names, weights=weights, method=args.method)
-    with resumable("cases"):
-        rows = studies.sweep.run(cases, **given(studies.sweep.run, args))
+    rows = resumed(studies.sweep.run, args, "cases", cases=cases)
     table = Path(args.out, studies.sweep.TABLE)
     args.found |= {"table": table, "rows": rows}
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
