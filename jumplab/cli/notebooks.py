@@ -213,7 +213,7 @@ def run_notebooks(
             # executed once, since removed or renamed
             if not (notebooks[0].parent / old.name).exists():
                 old.unlink()
-        _publish(work, out, figures)
+        publish(work, out, figures)
         shutil.rmtree(work)
     shutil.rmtree(out / "failed", ignore_errors=True)
     return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
@@ -341,7 +341,8 @@ def _kernel(scratch: str, notebook: Path, work: Path, groups: list[int]) -> type
     return ThisInterpreter
 
 
-def _publish(work: Path, out: Path, figures: Path) -> None:
+def publish(work: Path, out: Path, figures: Path) -> None:
+    """Move the results in ``work`` to ``out``, and its figures, but those that look the same."""
     io.folder.settle()
     with io.folder.transaction(out) as staging:
         for p in (work / "result").iterdir():

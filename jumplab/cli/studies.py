@@ -25,6 +25,7 @@ from jumplab.io.progress import tell
 from jumplab.task import JumpTask
 
 TARGET = "distance_m", "height_m", "platform_m", "side_m", "yaw_rad", "gravity"
+MAPS = ("side_m", "distance_m"), ("yaw_rad", "height_m")  # instead of the usual axes
 CAPTION = "Cells with a plan of the direct planner, coloured by the limit of which they use most."
 ASKED = {"foot_distance_m": "distance_m", "com_rise_m": "height_m"}  # metrics by another name
 
@@ -196,20 +197,15 @@ def envelope(args: Namespace) -> None:
         raise InputError(
             f"a map of sides has one height, got {len(args.height_m)}; give --height-m one number"
         )
-    axes = "distance_m", "height_m"
-    fixed = None
-    if args.side_m is not None:
-        axes = "side_m", "distance_m"
-        fixed = JumpTask(0.0, args.height_m[0])
-    elif args.yaw_rad is not None:
-        axes = "yaw_rad", "height_m"
+    axes = next((x for x in MAPS if getattr(args, x[0]) is not None), studies.envelope.AXES)
+    fixed = JumpTask(0.0, args.height_m[0]) if axes[0] == "side_m" else None
     across, up = (getattr(args, name) for name in axes)
-    if across is not args.distance_m:
+    if axes in MAPS:
         without(args, "holds jumps straight ahead", atlas=None)
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
-    options = given(studies.envelope.envelope, args, folder=args.out, atlas=atlas)
-    options |= {"distances": across, "heights": up, "axes": axes, "fixed": fixed}
-    envelope = studies.envelope.envelope(**options)
+    options = {"distances": across, "heights": up, "axes": axes, "fixed": fixed}
+    options |= {"folder": args.out, "atlas": atlas}
+    envelope = resumed(studies.envelope.envelope, args, "cells", **options)
     figure = jl.plots.envelope_map(envelope)
     args.found["map"] = asdict(envelope) | {"hash": args.robot.hash}
     io.folder.settle()
