@@ -40,7 +40,7 @@ class Fake:
 
 def refused(task, monkeypatch, planner):
     monkeypatch.setattr(
-        advice, "_refused", lambda p, t, m: SolverError("no") if m == "direct" else raised(p.plan, t, m)
+        advice, "refused", lambda p, t, m: SolverError("no") if m == "direct" else raised(p.plan, t, m)
     )
     with pytest.raises(JumplabError) as e:
         advice.plan_or_advise(planner, task)
@@ -86,7 +86,7 @@ def test_patience_is_a_number_of_seconds(monkeypatch):
     """A search that has taken longer ends with the best that it has, and says so."""
     planner = Fake()
     planner.plan = lambda task, method: (_ for _ in ()).throw(SolverError("no"))
-    monkeypatch.setattr(advice, "_refused", lambda p, t, m: None)
+    monkeypatch.setattr(advice, "refused", lambda p, t, m: None)
     with pytest.raises(SolverError) as e:
         advice.plan_or_advise(planner, JumpTask(0.2, 0.3), patience_s=1e-9)
     given_up = "no; planning was given up after 1e-09 s of processor time; ask for a distance of 0.12 m, "

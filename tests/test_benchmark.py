@@ -79,6 +79,7 @@ def test_the_command_prints_a_table_and_writes_the_numbers(monkeypatch, capsys, 
     assert json.loads((tmp_path / "b.json").read_text())["raw"] == MADE
 
 
+@pytest.mark.slow
 def test_the_growth_has_a_row_for_each_mesh():
     found = growth(Robot.load(), JumpTask(0.4, 0.3), (16, 24), 1)
     assert [x["intervals"] for x in found] == [16, 24] and all(x["iteration_s"] > 0 for x in found)

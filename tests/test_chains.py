@@ -21,7 +21,7 @@ from jumplab.task import JumpTask
 
 
 def test_course_of_numbers():
-    course = Course.of(["0.6", 0.5, 0.4], "0.3", [0, 0.2, 0.1])
+    course = Course.of([0.6, 0.5, 0.4], 0.3, [0, 0.2, 0.1])
     assert course.count == 3 and [task.height_m for task in course.tasks] == [0.3, 0.3, 0.3]
     assert course.goals_m == pytest.approx((0.6, 1.1, 1.5))
     assert [task.platform_m for task in course.tasks] == pytest.approx([0.0, 0.2, -0.1])
@@ -34,10 +34,10 @@ def test_course_of_numbers():
         (([], 0.3), "a chain has 1 ... 50 jumps, this one has 0; give one distance per jump"),
         (([0.6, 0.6], [0.3, 0.3, 0.3]), "3 heights for 2 distances: give one per jump"),
         (([0.6, 0.6], 0.3, [0.1]), "1 platforms for 2 distances: give one per jump"),
-        (([0.6, "far"], 0.3), "the distances of a chain must be numbers in m; number 2 is 'far'"),
-        (([0.6, True], 0.3), "the distances of a chain must be numbers in m; number 2 is True"),
-        (("0.6", 0.3), "the distances of a chain must be a list of numbers, got '0.6'"),
-        (([0.6, float("nan")], 0.3), "jump 2 of 2: distance must be finite, got nan"),
+        (([0.6, "far"], 0.3), "an entry of distances_m must be a number, got 'far'"),
+        (([0.6, True], 0.3), "an entry of distances_m must be a number, got True"),
+        (("0.6", 0.3), "distances_m must be a sequence, got '0.6'"),
+        (([0.6, float("nan")], 0.3), "an entry of distances_m must be finite, got nan"),
         (([0.6], 0.0), "jump 1 of 1: height = 0 m is outside 0.02 ... 1.5 m"),
         (([0.6, 0.6], 0.3, [0.8, -0.8]), "jump 2 of 2: platform = -1.6 m is outside -1 ... 1 m"),
         (([0.5, 0.5], 0.3, None, [0.1]), "1 sides for 2 distances: give one per jump"),

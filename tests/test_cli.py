@@ -165,9 +165,10 @@ def test_plan_and_audit(capsys, odd_folder, planner):
     assert planner.task.gravity == 3.7
     assert planner.task.distance_m == -0.2 and planner.task.height_m == 0.3 and planner.method == "direct"
     assert planner.task.rotation_rad == pytest.approx(-2 * 3.141592653589793)
-    assert said.splitlines()[:3] == [
-        "stage                  iterations     build     solve",
-        "SRMP launch                    31    0.25 s    0.12 s",
+    assert said.splitlines()[:4] == [
+        "stage        iterations  build_s  solve_s",
+        "-----------  ----------  -------  -------",
+        "SRMP launch          31     0.25     0.12",
         "planned: distance 1.000 m, rise 0.500 m",
     ]
     assert names(out) == ["passport.json", "plan.npz", "robot.toml", "robot.urdf", "summary.json"]

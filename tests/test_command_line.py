@@ -118,7 +118,7 @@ def test_a_terminal_sees_what_is_going_on(planned):
 
 def test_the_example_in_the_help_of_each_command_can_be_typed():
     """`--help` ends with a line that the parser takes; all commands have one but those without options."""
-    parser, count = cli._parser(), 0
+    parser, count = cli.make_parser(), 0
     for name, options in common.OPTIONS.items():
         if line := options.get("example"):
             words = line.split()

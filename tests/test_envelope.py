@@ -107,25 +107,6 @@ def test_maps_of_an_older_version_are_refused(bhr, tmp_path):
         envelope(bhr, (0.1,), (0.3,), folder=tmp_path)
 
 
-def test_every_cell_is_kept_at_once(bhr, tmp_path, monkeypatch):
-    """A map that is stopped within a row has the cells before; a map of its own is refused meanwhile."""
-    tried = []
-
-    def stopping(planner, task):
-        tried.append(task.distance_m)
-        if len(tried) == 3:
-            with pytest.raises(InputError, match="another 'jumplab envelope' is writing it"):
-                envelope(bhr, (0.1,), (0.3,), folder=tmp_path)
-            raise KeyboardInterrupt
-        return row(True)
-
-    monkeypatch.setattr("jumplab.studies.envelope.cell_row", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        envelope(bhr, (0.1, 0.2, 0.3), (0.3,), folder=tmp_path)
-    assert all(c.solved for c in envelope(bhr, (0.1, 0.2, 0.3), (0.3,), folder=tmp_path).cells)
-    assert tried == [0.1, 0.2, 0.3, 0.3]
-
-
 def test_far_cells_are_not_tried_for_ever(bhr, asked):
     cells = envelope(bhr, (0.1, 0.3, 0.4, 0.5, 0.6), (0.3, 1.0)).cells
     assert [c.limiting for c in cells] == ["friction", OPEN, OPEN, BEYOND, BEYOND, OPEN, OPEN, BEYOND, BEYOND, BEYOND]

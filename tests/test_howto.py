@@ -40,7 +40,7 @@ def test_there_are_as_many_as_the_page_says_and_each_is_short():
 def test_commands_can_be_typed(title):
     for line in "".join(blocks(TASKS[title], "sh")).splitlines():
         program, *words = shlex.split(line)
-        assert program == "jumplab" and command_line._parser().parse_args(words).command == words[0]
+        assert program == "jumplab" and command_line.make_parser().parse_args(words).command == words[0]
 
 
 @pytest.fixture

@@ -96,7 +96,7 @@ GOAL = jl.JumpTask(0.6, 0.15, side_m=0.1, yaw_rad=0.3)
 def test_a_clip_that_is_followed_to_a_target_lands_there():
     report = jl.judge(CLIPS / "jump_forward_level2.pkl", "g1")
     usual, moved = Draft(report), Draft(report, goal=GOAL)
-    first, last = (np.mean([moved._middle(hold)], axis=0) for hold in (moved.holds[0], moved.holds[-1]))
+    first, last = (np.mean([moved.middle(hold)], axis=0) for hold in (moved.holds[0], moved.holds[-1]))
     assert last - first == pytest.approx([GOAL.distance_m, GOAL.side_m, GOAL.yaw_rad])
     assert all(place.free_m == (0.0, 0.0) for place in moved.contacts.places)
     flight = next(phase for phase in moved.contacts.phases if phase.flying)

@@ -99,7 +99,7 @@ def test_figures_that_look_the_same_stay(tmp_path):
     for folder, text in ((figures, "old"), (work / "figures", "new")):
         for name in ("same.txt", "faint.pdf", "other.txt", "damaged.png", "alone.txt"):
             (folder / name).write_text(text)
-    notebooks._publish(work, out, figures)
+    notebooks.publish(work, out, figures)
     texts = {name: (figures / name).read_text() for name in ("same.txt", "faint.pdf", "other.txt", "alone.txt")}
     assert texts == {"same.txt": "old", "faint.pdf": "old", "other.txt": "new", "alone.txt": "new"}
     assert np.asarray(Image.open(figures / "other.png"))[0].max() == 0

@@ -6,11 +6,11 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from jumplab.arguments import real
+from jumplab.arguments import checked
 from jumplab.auditing import contact, dynamics, motion
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import LIMITS, AuditReport, Check, Limit, Measure, of_size
-from jumplab.errors import InputError, as_path, require_type
+from jumplab.errors import InputError, as_path
 from jumplab.io.files import write_file
 from jumplab.io.folder import CONFIG, PLAN, SUMMARY, URDF, read_json, sha256, versions
 from jumplab.io.progress import tell
@@ -36,6 +36,7 @@ GROUPS = (
 )
 
 
+@checked
 def audit(
     tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: float | None = None
 ) -> AuditReport:
@@ -54,12 +55,6 @@ def audit(
     edge_m : where the landing surface of another height begins, ahead of the toes' first place [m];
         by default 5 cm behind the landing soles if it is higher, 5 cm ahead of the toes if lower.
     """
-    require_type(tape, Tape, "the tape to audit")
-    require_type(robot, Robot, "its robot")
-    if task is not None:
-        require_type(task, JumpTask, "the target")
-    if edge_m is not None:
-        edge_m = real(edge_m, "edge_m", "m")
     open_tape(tape, robot, task)
     checks = _checks(motion.form(tape))
     capture = []

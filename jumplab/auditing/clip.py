@@ -190,8 +190,7 @@ def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     for column in still.T:
         _drop(column, False, least + 1)
         _drop(column, True, least + 1)
-    if not still.any(axis=0).all():
-        still |= ~still.any(axis=0)  # a foot that never rests tells no ground
+    still |= ~still.any(axis=0)  # a foot that never rests tells no ground
     rows = np.arange(len(height))
     level = np.column_stack(
         [np.interp(rows, rows[s], h[s]) for s, h in zip(still.T, height.T, strict=True)]

@@ -1,44 +1,26 @@
-"""What the commands share: how their options are read, the modules they load late, and what is
-printed of a result.
+"""What the commands share: how their options are read, and what is printed of a result.
+
+Help and refusals do not wait for the heavy libraries: ``jl`` and the sub-packages load them late.
 """
 
 import argparse
 import inspect
 import math
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import jumplab as jl
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.io.files import ensure_writable
 from jumplab.sim import DEFAULT_ENGINE, ENGINES
 
 # the value of an option, from its name and its text; raises InputError
 Kind = Callable[[str, str], Any]
 Work = Callable[[argparse.Namespace], None]
 MOST_VALUES = 10_000
-
-
-class Late:
-    """A module that is imported when it is first used: help and refusals need not wait for the
-    heavy libraries.
-    """
-
-    def __init__(self, name: str):
-        self._name = f"jumplab.{name}"
-
-    def __getattr__(self, attribute: str) -> Any:
-        return getattr(import_module(self._name), attribute)
-
-
-store = Late("io.folder")
-robots = Late("robot")
-pages = Late("show.viewer")
-tables = Late("show.tables")
-style = Late("show.style")
 
 
 # what options take ------------------------------------------------------------------------------
@@ -89,6 +71,7 @@ def values_of(option: str, text: str) -> list[float]:
 
 
 VALUES = "FROM:TO:COUNT or A,B,..."
+folder = needing("name a folder", str.strip)
 KINDS = {
     "number": number,
     "number or never": lambda option, text: None if text == "never" else number(option, text),
@@ -96,7 +79,9 @@ KINDS = {
     "whole": whole,
     "values": values_of,
     "values in degrees": lambda option, text: [math.radians(x) for x in values_of(option, text)],
-    "folder": needing("name a folder", str.strip),
+    "robot": lambda option, text: jl.Robot.load(text),
+    "folder": folder,
+    "writable": lambda option, text: ensure_writable(folder(option, text)) and text,
     "file": needing(
         "name a file in a folder that exists",
         lambda text: (
@@ -219,14 +204,15 @@ def given(function: Callable, args: argparse.Namespace, **more: Any) -> dict[str
     return {name: options[name] for name in names if name in options} | more
 
 
-@contextmanager
-def resumable(what: str = "trials") -> Iterator[None]:
-    """Say of work that is interrupted what is kept of it."""
+def resumed(function: Callable, args: argparse.Namespace, kept: str = "trials", **more: Any) -> Any:
+    """The result of a ``function`` with the arguments that are :func:`given`; if it is interrupted,
+    the command says that what is ``kept`` need not be done again.
+    """
     try:
-        yield
+        return function(**given(function, args, **more))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted; finished {what} are kept, and the same command goes on from there"
+            f"interrupted; finished {kept} are kept, and the same command goes on from there"
         ) from None
 
 
@@ -246,21 +232,13 @@ def judge(audit: Any, folder: str) -> None:
 
 def print_summary(summary: Mapping[str, Any]) -> None:
     """Cost of the stages and what was planned."""
-    print(f"{'stage':<22}{'iterations':>11}{'build':>10}{'solve':>10}")
-    line = "{stage:<22}{iterations:>11}{build_s:>8.2f} s{solve_s:>8.2f} s"
-    for row in summary["stages"]:
-        print(line.format_map(row))
+    columns = ("stage", "iterations", "build_s", "solve_s")
+    print(jl.plots.table(summary["stages"], columns, decimals=2))
     line = "planned: distance {planned_distance_m:.3f} m, rise {planned_rise_m:.3f} m"
     if summary.get("planned_side_m") is not None:
         line += ", side {planned_side_m:.3f} m, turn {turn_deg:.1f} deg"
     turn = math.degrees(summary.get("planned_yaw_rad") or 0.0)
     print(line.format_map({**summary, "turn_deg": turn}))
-    if phases := summary.get("tracking"):
-        shares = [
-            (name, 100 * phases[name]["rho"]["relative_rms"]) for name in ("launch", "flight")
-        ]
-        words = ", ".join(f"{share:.1f} % in {name}" for name, share in shares)
-        print(f"inertia off stage 1's by {words} (rms)")
 
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:

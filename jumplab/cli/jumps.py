@@ -9,29 +9,20 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from jumplab import sim, studies
+import jumplab as jl
+from jumplab import io, sim, studies
 from jumplab.cli import notebooks
 from jumplab.cli.common import (
-    Late,
     disturbances,
     given,
     judge,
-    pages,
+    named,
     print_simulation,
     print_summary,
-    robots,
-    store,
     without,
 )
 from jumplab.errors import InputError
 from jumplab.task import JumpTask
-
-motions = Late("io.motion")
-exports = Late("io.export")
-api = Late("api")
-auditing = Late("auditing")
-movies = Late("show.movies")
-tables = Late("show.tables")
 
 
 def run(args: Namespace) -> None:
@@ -41,9 +32,7 @@ def run(args: Namespace) -> None:
     if args.engine is not None:
         values["engine"] = args.engine
     for pair in args.parameter:
-        name, equals, text = pair.partition("=")
-        if not (equals and name.isidentifier()):
-            raise InputError(f"--parameter must be NAME=VALUE, got {pair!r}")
+        name, text = named("--parameter must be NAME=VALUE", pair)
         if name in values:
             raise InputError(f"--parameter {name} is given twice, or has an option of its own")
         try:
@@ -55,10 +44,10 @@ def run(args: Namespace) -> None:
     report = notebooks.run_notebooks(values, notebooks=chosen, **options)
     args.found |= vars(report)
     if (report.out / "plan.npz").is_file():
-        args.found["plan"] = store.read_plan(report.out)[2]
+        args.found["plan"] = io.folder.read_plan(report.out)[2]
         print_summary(args.found["plan"])
     if (report.out / "simulation.json").is_file():
-        args.found["simulation"] = store.read_json(report.out / "simulation.json")
+        args.found["simulation"] = io.folder.read_json(report.out / "simulation.json")
         print_simulation(args.found["simulation"])
     print(f"figures in {report.figures}, results and executed notebooks in {report.out}")
     if (report.out / "jump.html").is_file():
@@ -76,32 +65,32 @@ def plan(args: Namespace) -> None:
         without(args, why, distance_m=1.0, height_m=0.5, like=None)
         without(args, why, robust=False, atlas=None, starts=1)
         task = None
-    robot = robots.Robot.load(args.robot)
-    store.ensure_writable(args.out)
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
     ranges = None
     if args.robust:
         ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     else:
         without(args, "says what --robust allows for, which is not given", disturb=[])
-    options = given(api.plan, args, task=task, robot=robot, robust=ranges)
+    options = given(jl.plan, args, task=task, robust=ranges)
     with warnings.catch_warnings(action="ignore"):  # the audit is told below
-        plan = api.plan(**options, atlas=atlas)
-    report = api.save(args.out, plan)
+        plan = jl.plan(**options, atlas=atlas)
+    report = jl.save(args.out, plan)
     args.found |= {"out": args.out, "plan": plan.summary, "audit": _audited(report)}
     print_summary(plan.summary)
     if args.starts > 1:
-        print(tables.table([vars(x) for x in plan.attempts], digits=3))
+        print(jl.plots.table([vars(x) for x in plan.attempts], digits=3))
     print(f"plan in {args.out}, whole run: {time.perf_counter() - start:.1f} s")
     judge(report, args.out)
 
 
 def audit(args: Namespace) -> None:
     """Check a plan by a second code path."""
-    store.read_plan(args.dir)  # refuses a damaged folder
-    folder = store.ensure_writable(args.dir)
-    with store.transaction(folder) as staging:
-        report = auditing.write_audit(folder, into=staging)
+    from jumplab.auditing import write_audit
+
+    io.folder.read_plan(args.dir)  # refuses a damaged folder
+    folder = io.folder.ensure_writable(args.dir)
+    with io.folder.transaction(folder) as staging:
+        report = write_audit(folder, into=staging)
     args.found |= _audited(report)
     print(report.table())
     judge(report, args.dir)
@@ -121,14 +110,14 @@ def simulate(args: Namespace) -> None:
     drawn = None
     if not sizes:
         without(args, "says where --disturb acts, which is not given", seed=None)
-    tape, robot, summary = store.read_plan(args.dir)
-    store.ensure_writable(args.dir)
+    tape, robot, summary = io.folder.read_plan(args.dir)
+    io.folder.ensure_writable(args.dir)
     if sizes:
         drawn = sim.Perturbation.draw(robot, args.seed or 0, ranges)
     scene = sim.Scene.of_plan(summary, robot)
     options = given(sim.simulate_jump, args, scene=scene, perturbation=drawn)
     result = sim.simulate_jump(tape, robot, **options)
-    store.write_simulation(args.dir, result, summary)
+    io.folder.write_simulation(args.dir, result, summary)
     metrics = result.to_json()
     args.found |= metrics
     print_simulation(metrics)
@@ -138,22 +127,24 @@ def view(args: Namespace) -> None:
     """A jump in 3-D, as one HTML file, or as a moving picture."""
     if args.movie:
         without(args, "names the page, and --movie is given instead of it", out=None)
-    tape, robot, summary = store.read_plan(args.dir)
+    tape, robot, summary = io.folder.read_plan(args.dir)
     path = Path(args.movie or args.out or Path(args.dir, "jump.html"))
-    store.ensure_writable(path.parent)
+    io.folder.ensure_writable(path.parent)
     simulation, settings = None, {}
-    if Path(args.dir, motions.SIMULATION_NAME).is_file():
-        simulation = motions.Motion.of_simulation_file(args.dir, robot)
-        settings = store.read_json(Path(args.dir, "simulation.json"))
+    if Path(args.dir, io.motion.SIMULATION_NAME).is_file():
+        simulation = io.motion.Motion.of_simulation_file(args.dir, robot)
+        settings = io.folder.read_json(Path(args.dir, "simulation.json"))
     scene = sim.Scene.of_run(settings, summary, robot)
     if args.movie:
-        film = movies.write_movie(path, robot, simulation or tape, scene)
+        from jumplab.show.movies import write_movie
+
+        film = write_movie(path, robot, simulation or tape, scene)
         args.found |= {"frames": film.frames, "drawn_by": film.drawn_by}
         words = f"{film.frames} frames, {film.seconds:.1f} s at half speed"
         hint = ""
     else:
         task = JumpTask(**summary["target"])
-        page = pages.page(robot, plan=tape, simulation=simulation, task=task, scene=scene)
+        page = jl.plots.page(robot, plan=tape, simulation=simulation, task=task, scene=scene)
         page.save(path)
         args.found["title"] = words = page.title
         hint = "; open it in any browser"
@@ -164,13 +155,13 @@ def view(args: Namespace) -> None:
 
 def export(args: Namespace) -> None:
     """A jump of the whole robot for other programs."""
-    tape, robot, _ = store.read_plan(args.dir)
-    motion = motions.Motion.of(tape)
+    tape, robot, _ = io.folder.read_plan(args.dir)
+    motion = io.motion.Motion.of(tape)
     if args.simulated:
-        motion = motions.Motion.of_simulation_file(args.dir, robot)
+        motion = io.motion.Motion.of_simulation_file(args.dir, robot)
     source = motion.source
-    path = Path(args.out or Path(args.dir, exports.default_name(args.format, source)))
-    exports.write(args.format, motion, robot, path, fps=args.fps)
+    path = Path(args.out or Path(args.dir, io.export.default_name(args.format, source)))
+    io.export.write(args.format, motion, robot, path, fps=args.fps)
     args.found |= {"file": path, "format": args.format, "source": source}
     args.found["duration_s"] = motion.duration
     until = "" if args.simulated else " to touchdown"

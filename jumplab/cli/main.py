@@ -44,7 +44,7 @@ def completion(args: argparse.Namespace) -> None:
     """Completion of commands and options: eval "$(jumplab completion bash)"."""
     import shtab
 
-    args.found["script"] = shtab.complete(_parser(), args.shell)
+    args.found["script"] = shtab.complete(make_parser(), args.shell)
     print(args.found["script"])
 
 
@@ -67,7 +67,8 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; '{self.prog} --help' shows what is possible")
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
     parser = _Parser(prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.")
     add_common(parser)
     parser.add_argument("--version", action="store_true", help="print the version and exit")
@@ -78,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _work(argv: Sequence[str], results: dict[str, Any]) -> None:
     """Do what was typed; ``results`` is filled with what --json prints."""
-    parser = _parser()
+    parser = make_parser()
     for text in argv:  # argparse would make an empty list of it
         if re.fullmatch(r"-[^=]*=--", text):
             parser.error(f"{text}: '--' is not a value")

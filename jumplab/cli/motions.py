@@ -6,12 +6,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from jumplab.cli.common import Late, pages, print_summary, robots, store, tables
+import jumplab as jl
+from jumplab import io
 from jumplab.cli.common import judge as audited
+from jumplab.cli.common import print_summary
 from jumplab.errors import InfeasibleError
-
-api = Late("api")
-auditing = Late("auditing")
 
 REPORT = "judged.json"
 CHANGES = "mended.json"
@@ -19,8 +18,7 @@ CHANGES = "mended.json"
 
 def judge(args: Namespace) -> None:
     """Judge motion clips: what of them no robot could do."""
-    robot = robots.Robot.load(args.robot)
-    found = api.judge(args.file, robot, fps=args.fps, order=args.order)
+    found = jl.judge(args.file, args.robot, fps=args.fps, order=args.order)
     reports = found if isinstance(found, list) else [found]
     passed = sum(report.passed for report in reports)
     rows = [report.row() for report in reports]
@@ -29,10 +27,10 @@ def judge(args: Namespace) -> None:
     args.found |= {"clips": rows, "physical": passed, "causes": causes}
     args.found["reports"] = [json.loads(report.to_json()) for report in reports]
     if args.out:
-        _write(Path(store.ensure_writable(args.out)), reports, args.found)
+        _write(args.out, reports, args.found)
     if len(reports) > 1:
         counts = [row | {"failed": len(r.failed)} for row, r in zip(rows, reports, strict=True)]
-        print(tables.table(counts, digits=3))
+        print(jl.plots.table(counts, digits=3))
         listed = ", ".join(f"{name} {n}" for name, n in causes.items() if n)
         reasons = f"; not for: {listed}" if listed else ""
         print(f"physical: {passed} of {len(reports)} clips{reasons}")
@@ -47,29 +45,29 @@ def judge(args: Namespace) -> None:
 
 def _write(folder: Path, reports: list[Any], found: dict[str, Any]) -> None:
     """The reports as JSON, and of each clip a page in 3-D."""
-    with store.transaction(folder) as staging:
-        (staging / REPORT).write_text(store.to_json(found), encoding="utf-8")
+    with io.folder.transaction(folder) as staging:
+        (staging / REPORT).write_text(io.folder.to_json(found), encoding="utf-8")
         for report in reports:
             title = report.line()
-            page = pages.page(report.clip.robot, plan=report.tape, title=title)
+            page = jl.plots.page(report.clip.robot, plan=report.tape, title=title)
             page.save(staging / f"{report.clip.name}.html")
 
 
 def mend(args: Namespace) -> None:
     """The nearest motion to a clip that the robot can do, as a plan."""
-    robot = robots.Robot.load(args.robot)
-    store.ensure_writable(args.out)
-    mended = api.mend(args.file, robot, fps=args.fps, order=args.order)
+    from jumplab.auditing import write_audit
+
+    mended = jl.mend(args.file, args.robot, fps=args.fps, order=args.order)
     plan = mended.plan
 
     def complete(folder: Path) -> Any:
-        (folder / CHANGES).write_text(store.to_json(mended.to_json()), encoding="utf-8")
-        return auditing.write_audit(folder)
+        (folder / CHANGES).write_text(io.folder.to_json(mended.to_json()), encoding="utf-8")
+        return write_audit(folder)
 
-    report = store.write_plan(args.out, plan.tape, plan.robot, plan.summary, complete=complete)
+    report = io.folder.write_plan(args.out, plan.tape, plan.robot, plan.summary, complete=complete)
     args.found |= {"out": args.out, "plan": plan.summary, **mended.to_json()}
     print_summary(plan.summary)
     print(mended.line())
-    print(tables.table(mended.changes, ["what", "clip", "mended", "change"], digits=3))
+    print(jl.plots.table(mended.changes, ["what", "clip", "mended", "change"], digits=3))
     print(f"shaped most by: {', '.join(mended.binding) or 'no limit'}")
     audited(report, args.out)

@@ -26,9 +26,9 @@ from subprocess import DEVNULL
 from types import ModuleType
 from typing import Any
 
-from jumplab import errors, reading, sim
+import jumplab as jl
+from jumplab import errors, io, reading, sim
 from jumplab.arguments import fitting
-from jumplab.cli.common import robots, store
 from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
 from jumplab.task import JumpTask
 
@@ -189,14 +189,14 @@ def run_notebooks(
     installed = notebooks[0].is_relative_to(_PACKAGE)
     if out is None:
         out = (Path.cwd() if installed else root) / "executed"
-    out = store.ensure_writable(out).resolve()
-    figures = store.ensure_writable(out / "figures" if figures is None else figures).resolve()
+    out = io.folder.ensure_writable(out).resolve()
+    figures = io.folder.ensure_writable(out / "figures" if figures is None else figures).resolve()
     executed = reading.below(out, "notebooks")
     reading.below(out, "failed")
     if executed.is_dir():
-        with store.locked(executed, wait_s=0.0):
+        with io.folder.locked(executed, wait_s=0.0):
             pass  # another chain is refused at once
-    with store.transaction(executed) as staging:
+    with io.folder.transaction(executed) as staging:
         work = staging / "work"
         for name in ("result", "figures"):
             (work / name).mkdir(parents=True)
@@ -213,7 +213,7 @@ def run_notebooks(
             # executed once, since removed or renamed
             if not (notebooks[0].parent / old.name).exists():
                 old.unlink()
-        _publish(work, out, figures)
+        publish(work, out, figures)
         shutil.rmtree(work)
     shutil.rmtree(out / "failed", ignore_errors=True)
     return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
@@ -234,7 +234,7 @@ def _checked(values: dict[str, Any], declared: Iterable[Kinds]) -> dict[str, Any
             check_value(name, value, kinds.get(name))
     JumpTask(values.get("distance_m", 0.0), values.get("height_m", 0.5))
     if "robot" in values:
-        robots.Robot.load(values["robot"])
+        jl.Robot.load(values["robot"])
         if Path(values["robot"]).is_file():
             values["robot"] = str(Path(values["robot"]).resolve())
     values = {"engine": sim.DEFAULT_ENGINE, **values, "out": "result", "figures": "figures"}
@@ -341,9 +341,10 @@ def _kernel(scratch: str, notebook: Path, work: Path, groups: list[int]) -> type
     return ThisInterpreter
 
 
-def _publish(work: Path, out: Path, figures: Path) -> None:
-    store.settle()
-    with store.transaction(out) as staging:
+def publish(work: Path, out: Path, figures: Path) -> None:
+    """Move the results in ``work`` to ``out``, and its figures, but those that look the same."""
+    io.folder.settle()
+    with io.folder.transaction(out) as staging:
         for p in (work / "result").iterdir():
             if p.is_file():
                 os.replace(p, staging / p.name)
@@ -354,7 +355,7 @@ def _publish(work: Path, out: Path, figures: Path) -> None:
     }
     for p in files:
         if p.with_suffix("") not in same:
-            store.write_file(figures / p, (made / p).read_bytes())
+            io.folder.write_file(figures / p, (made / p).read_bytes())
 
 
 def _alike(new: Path, old: Path) -> bool:

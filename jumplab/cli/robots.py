@@ -2,59 +2,60 @@
 
 from __future__ import annotations
 
-import hashlib
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jumplab.cli.common import Late, robots, store, style, tables
+import jumplab as jl
+from jumplab import io
 from jumplab.errors import InputError, JumplabError, RobotError
 
 if TYPE_CHECKING:  # help of a command is there before NumPy is
     from jumplab.robot_import.roles import Draft
 
-checkup = Late("robot_import.checkup")
-files = Late("robot.files")
-jumper = Late("robot_import.jumper")
-urdfs = Late("robot_import.urdf")
-MARK = b"# unless edited, the sum of what is above: "
-sheets = Late("show.bodies")
-
 
 def list_(args: Namespace) -> None:
     """The shipped robots."""
+    from jumplab.robot.files import SHIPPED
+    from jumplab.robot_import.urdf import DESCRIPTIONS
+
     rows = []
-    for name, file in files.SHIPPED.items():
+    for name, file in SHIPPED.items():
         row = {"name": name, "kg": None, "joints": None, "arms": "", "note": ""}
         try:
-            if urdfs.DESCRIPTIONS in file.read_text(encoding="utf-8"):  # a list downloads nothing
+            if DESCRIPTIONS in file.read_text(encoding="utf-8"):  # a list downloads nothing
                 raise RobotError(
                     f"{name}: is downloaded when it is first loaded, with jumplab[descriptions]"
                 )
-            robot = robots.Robot.load(name)
+            robot = jl.Robot.load(name)
             row |= {"kg": robot.total_mass, "joints": len(robot.joint_names)}
             row["arms"] = "swing" if robot.joints["shoulder_pitch"] else "held"
         except JumplabError as e:
             row["note"] = str(e).rpartition(": ")[2]
         rows.append(row)
     args.found["robots"] = rows
-    print(tables.table(rows, digits=3))
+    print(jl.plots.table(rows, digits=3))
 
 
 def check(args: Namespace) -> None:
     """Find hips, knees, ankles, shoulders and soles of a URDF, and judge it."""
+    from jumplab.robot.files import SHIPPED, toml_text
+    from jumplab.robot_import import checkup
+    from jumplab.robot_import.jumper import REPAIRS
+    from jumplab.robot_import.urdf import described
+
     urdf = args.urdf
     if (urdf is None) == (args.robot_description is None):
         raise InputError(
             "jumplab robot check: name a URDF, or a robot by --robot-description; one of the two"
         )
     if urdf is None:
-        urdf = str(urdfs.described(args.robot_description))
+        urdf = str(described(args.robot_description))
         print(f"robot description: {urdf}")
     for word in args.repair:
-        if word not in jumper.REPAIRS:
-            raise InputError(f"--repair accepts {', '.join(jumper.REPAIRS)}, got {word!r}")
-    shipped = files.SHIPPED.get(urdf)
+        if word not in REPAIRS:
+            raise InputError(f"--repair accepts {', '.join(REPAIRS)}, got {word!r}")
+    shipped = SHIPPED.get(urdf)
     if args.repair and (args.config is not None or shipped):
         raise InputError(
             "--repair is for a bare URDF; a configuration has its own [source] repair, so leave it "
@@ -62,7 +63,7 @@ def check(args: Namespace) -> None:
         )
     if args.config is not None:
         try:
-            text = files.toml_text(Path(args.config).read_bytes(), f"--config {args.config}")
+            text = toml_text(Path(args.config).read_bytes(), f"--config {args.config}")
         except (OSError, ValueError) as e:
             raise InputError(
                 f"--config {args.config}: cannot be read as text ({type(e).__name__})"
@@ -81,11 +82,11 @@ def check(args: Namespace) -> None:
     robot = result.robot
     args.found |= {"robot": robot.name, "notes": result.lines(), "roles": result.rows()}
     print(*result.lines(), sep="\n")
-    print(tables.table(result.rows()))
+    print(jl.plots.table(result.rows()))
     if args.out is not None:
         views = "Side view, moving joints from the front, and the five links of the sagittal plane"
-        picture = sheets.robot_sheet(robot)
-        style.save_figure(picture, robot.name, args.out, f"{views}, standing.", robot=robot)
+        picture = jl.plots.robot_sheet(robot)
+        jl.plots.save_figure(picture, robot.name, args.out, f"{views}, standing.", robot=robot)
         print(f"picture: {Path(args.out) / robot.name}.png")
 
 
@@ -103,6 +104,8 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
 
     Faults of limits alone do not hinder the writing: they are mended there.
     """
+    from jumplab.robot_import import checkup
+
     draft, faults = checkup.first_look(urdf, repair)
     path = None
     if draft:
@@ -124,22 +127,21 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
 
 
 def _write(folder: Path, text: str, force: bool) -> Path:
-    """Write a starter configuration, but not over one that somebody has edited; its path."""
+    """Write a starter configuration, but not over another one, which somebody may have edited; its
+    path.
+    """
+    from jumplab.robot import files
+
     path = folder / f"{files.read_toml(text, 'starter')['name']}.toml"
-    if path.exists() and not force and path.read_bytes() != _marked(path.read_bytes()):
+    content = text.encode()
+    if path.exists() and not force and path.read_bytes() != content:
         raise InputError(
-            f"{path}: has been edited; choose another --out, or overwrite it with --force"
+            f"{path}: has been edited, or another version wrote it; choose another --out, or overwrite it with --force"
         )
     try:
-        store.write_file(path, _marked(text.encode()))
+        io.folder.write_file(path, content)
     except InputError as e:
         reason = getattr(e.__cause__, "strerror", e)
         raise InputError(f"{path}: cannot be written ({reason})") from e
     print(f"starter configuration: {path}")
     return path
-
-
-def _marked(text: bytes) -> bytes:
-    """A configuration with a last line that tells whether it is still as it was written."""
-    content = text.rpartition(MARK)[0] or text
-    return content + MARK + hashlib.sha256(content).hexdigest()[:12].encode() + b"\n"

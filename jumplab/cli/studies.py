@@ -9,18 +9,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jumplab import sim, studies
+import jumplab as jl
+from jumplab import io, sim, studies
 from jumplab.cli.common import (
-    Late,
     disturbances,
     given,
     named,
-    pages,
-    resumable,
-    robots,
-    store,
-    style,
-    tables,
+    resumed,
     values_of,
     without,
 )
@@ -29,11 +24,8 @@ from jumplab.errors import InfeasibleError, InputError
 from jumplab.io.progress import tell
 from jumplab.task import JumpTask
 
-api = Late("api")
-certificate_pages = Late("show.certificate")
-pictures = Late("show.maps")
-
 TARGET = "distance_m", "height_m", "platform_m", "side_m", "yaw_rad", "gravity"
+MAPS = ("side_m", "distance_m"), ("yaw_rad", "height_m")  # instead of the usual axes
 CAPTION = "Cells with a plan of the direct planner, coloured by the limit of which they use most."
 ASKED = {"foot_distance_m": "distance_m", "com_rise_m": "height_m"}  # metrics by another name
 
@@ -41,35 +33,29 @@ ASKED = {"foot_distance_m": "distance_m", "com_rise_m": "height_m"}  # metrics b
 def trials(args: Namespace) -> None:
     """Let many perturbed robots jump a plan."""
     if args.basin:
-        if args.seed is not None:
-            raise InputError(
-                "--seed says which robots are drawn, and --basin draws none; leave one of them away"
-            )
-        without(
-            args, "is for robots that are drawn, and --basin draws none", disturb=[], keep_falls=0
-        )
+        why = "is for robots that are drawn, and --basin draws none"
+        without(args, why, seed=None, disturb=[], keep_falls=0)
         without(
             args, "acts in launch, and the basin's states are those of a flight", feedback=False
         )
     ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    settings = _settings(args, noise=noise, ranges=ranges)
-    work = paper("basin").landing_basin if args.basin else studies.trials.run_trials
-    options = given(work, args, settings=settings)
-    if not args.basin:  # 200: a success rate near 95 % is then known to 3 % on either side
+    options = {"folder": args.dir, "settings": _settings(args, noise=noise, ranges=ranges)}
+    if args.basin:
+        report = resumed(paper("basin").landing_basin, args, **options)
+    else:  # 200: a success rate near 95 % is then known to 3 % on either side
         options |= {"n": args.n or 200, "seed": args.seed or 0}
-    with resumable():
-        report = work(args.dir, **options)
+        report = resumed(studies.trials.run_trials, args, **options)
     data = report.to_json()
     args.found |= data | {"resumed": report.resumed}
     for what, condition in report.conditions.items():
         print(f"{what}: {condition}")
-    print(tables.table(report.rows()))
+    print(jl.plots.table(report.rows()))
     measured = data.get("landed_metrics", {}).items()
     asked = report.target | {key: report.target[name] for key, name in ASKED.items()}
     lengths = [{"of the landed": key, "asked": asked[key]} | x for key, x in measured if x]
     if lengths:
-        print(tables.table(lengths))
+        print(jl.plots.table(lengths))
     print(report.line())
     name = "basin" if args.basin else "trials"
     print(f"{name}.json in {args.dir}, {report.resumed} trials from an earlier run")
@@ -82,12 +68,10 @@ def _settings(args: Namespace, **more: Any) -> Any:
 def margins(args: Namespace) -> None:
     """The largest size of each disturbance that a plan tolerates."""
     names = args.disturb or (*studies.margins.SINGLE, *studies.margins.PAIRS)
-    work = studies.margins.margins
-    options = given(work, args, names=names, seed=args.seed or 0, settings=_settings(args))
-    with resumable():
-        report = work(args.dir, **options)
+    options = {"folder": args.dir, "seed": args.seed or 0, "settings": _settings(args)}
+    report = resumed(studies.margins.margins, args, names=names, **options)
     args.found |= report.to_json()
-    print(tables.table([margin.row() for margin in report.margins], digits=3))
+    print(jl.plots.table([margin.row() for margin in report.margins], digits=3))
     print(f"{report.line()}; margins.json in {args.dir}")
 
 
@@ -95,15 +79,14 @@ def certify(args: Namespace) -> None:
     """Do two physics agree on a plan? Audit, both engines, two modes, both contacts."""
 
     def page(certificate: Any) -> str:
-        return certificate_pages.certificate_page(certificate).html
+        return jl.plots.certificate_page(certificate).html
 
-    options = given(studies.certify.certify, args, seed=args.seed or 0, page=page)
-    with resumable():
-        certificate = studies.certify.certify(args.dir, **options)
+    options = {"folder": args.dir, "seed": args.seed or 0, "page": page}
+    certificate = resumed(studies.certify.certify, args, **options)
     args.found |= certificate.to_json()
     for mode in certificate.modes:
         print(f"{mode.mode} mode")
-        print(tables.table([d.row() for d in mode.differences], digits=3))
+        print(jl.plots.table(mode.differences, studies.certify.COLUMNS, digits=3))
         landed = ", ".join(f"{count} in {name}" for name, count in mode.landed.items())
         print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
     for engine, trial in certificate.usual.items():
@@ -125,17 +108,15 @@ def certify(args: Namespace) -> None:
 
 def clips(args: Namespace) -> None:
     """Thirty jumps to all sides, planned, audited, landed alike in both engines, as clips."""
-    robot = robots.Robot.load(args.robot)
-    options = given(studies.clips.make_clips, args, robot=robot, format_name=args.format, say=print)
-    with resumable("clips"):
-        library = studies.clips.make_clips(**options)
+    options = {"format_name": args.format, "say": print}
+    library = resumed(studies.clips.make_clips, args, "clips", **options)
     args.found |= {"out": args.out} | library
     passed = len(library["clips"])
     count = passed + len(library["left_out"])
     print(f"{passed} of {count} clips passed; index.json in {args.out}")
     if not passed:
         reason = library["left_out"][0]["reasons"][0]
-        raise InfeasibleError(f"no clip of {robot.name} passed: {reason}")
+        raise InfeasibleError(f"no clip of {args.robot.name} passed: {reason}")
 
 
 def chain(args: Namespace) -> None:
@@ -150,21 +131,19 @@ def chain(args: Namespace) -> None:
             )
     axes = (args.distance_m, args.height_m, args.platform_m, args.side_m, args.yaw_rad)
     course = studies.chain.Course.of(*axes)
-    robot = robots.Robot.load(args.robot)
-    store.ensure_writable(args.out)
     ranges = studies.chain.RANGES[args.ranges or "slight"]
     seed = args.seed or 0
     drawn = None
     if args.seed is not None or args.runs > 1:
-        drawn = sim.Perturbation.draw(robot, seed, ranges)
-    options = given(studies.chain.run_chain, args, course=course, robot=robot)
+        drawn = sim.Perturbation.draw(args.robot, seed, ranges)
+    options = given(studies.chain.run_chain, args, course=course)
     result = studies.chain.run_chain(**options, perturbation=drawn)
     series = None
     if args.runs > 1:
         options |= {"n": args.runs, "seed": seed, "ranges": ranges, "jobs": args.jobs}
         series = studies.chain.run_chains(**options)
     where = {"scene": result.scene, "marks_m": course.goals_m}
-    page = pages.page(result.robot, simulation=result, title="A chain of jumps", **where)
+    page = jl.plots.page(result.robot, simulation=result, title="A chain of jumps", **where)
     audits = studies.chain.write_chain(args.out, result, {"chain.html": page.html}, series=series)
     args.found |= {"out": args.out} | result.to_json() | {"series": series}
     _print_chain(result, series)
@@ -196,7 +175,7 @@ SERIES_COLUMNS = {
 
 def _print_chain(result: Any, series: dict[str, Any] | None) -> None:
     """Jump by jump, then the verdict; how the perturbed robots fared, if there are any."""
-    print(tables.table(result.rows(), CHAIN_COLUMNS, decimals=3))
+    print(jl.plots.table(result.rows(), CHAIN_COLUMNS, decimals=3))
     ready = f"{result.in_time} of {len(result.replans)}"
     print(f"plans made on the way: {ready} were there when the robot was ready for them")
     print("chain: stands after every jump" if result.stood else f"chain: FAILED, {result.reason}")
@@ -204,7 +183,7 @@ def _print_chain(result: Any, series: dict[str, Any] | None) -> None:
         return
     low, high = series["interval"]
     row = series | {"interval": f"{low:.1%} ... {high:.1%}"}
-    print(tables.table([row], SERIES_COLUMNS, digits=3))
+    print(jl.plots.table([row], SERIES_COLUMNS, digits=3))
     for trial in series["trials"]:
         if not trial["stood"]:
             print("  seed {seed}: {reason}".format_map(trial))
@@ -218,90 +197,74 @@ def envelope(args: Namespace) -> None:
         raise InputError(
             f"a map of sides has one height, got {len(args.height_m)}; give --height-m one number"
         )
-    robot = robots.Robot.load(args.robot)
-    store.ensure_writable(args.out)
-    axes = "distance_m", "height_m"
-    fixed = None
-    if args.side_m is not None:
-        axes = "side_m", "distance_m"
-        fixed = JumpTask(0.0, args.height_m[0])
-    elif args.yaw_rad is not None:
-        axes = "yaw_rad", "height_m"
+    axes = next((x for x in MAPS if getattr(args, x[0]) is not None), studies.envelope.AXES)
+    fixed = JumpTask(0.0, args.height_m[0]) if axes[0] == "side_m" else None
     across, up = (getattr(args, name) for name in axes)
-    if across is not args.distance_m:
+    if axes in MAPS:
         without(args, "holds jumps straight ahead", atlas=None)
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
-    options = given(studies.envelope.envelope, args, robot=robot, folder=args.out, atlas=atlas)
-    options |= {"distances": across, "heights": up, "axes": axes, "fixed": fixed}
-    envelope = studies.envelope.envelope(**options)
-    figure = pictures.envelope_map(envelope)
-    args.found["map"] = asdict(envelope) | {"hash": robot.hash}
-    store.settle()
-    text = store.to_json(args.found["map"])
-    store.write_file(Path(args.out, "envelope.json"), text.encode())
-    style.save_figure(figure, "envelope", args.out, CAPTION, robot=robot)
+    options = {"distances": across, "heights": up, "axes": axes, "fixed": fixed}
+    options |= {"folder": args.out, "atlas": atlas}
+    envelope = resumed(studies.envelope.envelope, args, "cells", **options)
+    figure = jl.plots.envelope_map(envelope)
+    args.found["map"] = asdict(envelope) | {"hash": args.robot.hash}
+    io.folder.settle()
+    text = io.folder.to_json(args.found["map"])
+    io.folder.write_file(Path(args.out, "envelope.json"), text.encode())
+    jl.plots.save_figure(figure, "envelope", args.out, CAPTION, robot=args.robot)
     solved = sum(c.solved for c in envelope.cells)
     print(f"map in {args.out}: {solved} of {len(envelope.cells)} cells have a plan")
     if not solved:
         reason = next((c.reason for c in envelope.cells if c.reason), "no cell has a plan")
-        raise InfeasibleError(f"{robot.name} can do none of these jumps: {reason}")
+        raise InfeasibleError(f"{args.robot.name} can do none of these jumps: {reason}")
     for word, cell in (("highest", envelope.highest), ("farthest", envelope.farthest)):
-        jump = style.describe_task(cell.task)
+        jump = jl.plots.describe_task(cell.task)
         print(f"{word}: {jump}, limited by {cell.limiting} ({100 * cell.share:.0f} % used)")
 
 
 def record(args: Namespace) -> None:
     """How far a robot can go in one number of the target, what ends it, what more would buy."""
-    robot = robots.Robot.load(args.robot)
     numbers = {name: getattr(args, name) for name in TARGET if getattr(args, name) is not None}
-    task = None
-    if numbers:
-        task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers)
-    if args.out:
-        store.ensure_writable(args.out)
-    options = given(studies.record.record, args, robot=robot, given=task)
+    task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers) if numbers else None
+    options = given(studies.record.record, args, given=task)
     found = studies.record.record(**options)
-    args.found["record"] = {"what": found.what, "value": found.value, "unit": found.unit}
-    if math.isfinite(found.bound):
-        args.found["record"]["bound"] = found.bound
-    args.found["record"] |= {"found": found.found, "limits": [asdict(x) for x in found.limits]}
-    args.found["record"]["landed"] = {name: run.landed for name, run in found.runs.items()}
+    limits = [asdict(x) for x in found.limits]
+    told = {name: getattr(found, name) for name in ("what", "value", "unit", "bound", "found")}
+    landed = {name: run.landed for name, run in found.runs.items()}
+    args.found["record"] = told | {"limits": limits, "landed": landed}
     print(found.line())
     print(f"audit: {found.audit.line()}")
     for name, run in found.runs.items():
         print(f"at {found.share:.0%} of it in {name}: {run.line()}")
     columns = ("limit", "joint", "phase", "from_s", "to_s", "worth")
-    print(tables.table([asdict(x) for x in found.limits], columns, digits=3))
+    print(jl.plots.table(limits, columns, digits=3))
     if args.prices:
         prices = found.prices()
-        args.found["prices"] = [asdict(row) for row in prices.rows]
-        print(tables.table([asdict(row) | {"gap": row.gap} for row in prices.rows], digits=3))
+        args.found["prices"] = [asdict(row) | {"gap": row.gap} for row in prices.rows]
+        print(jl.plots.table(args.found["prices"], digits=3))
         print(prices.line())
     if args.improve:
         better = found.improve({"gear": args.improve.split(",")})
-        args.found["improved"] = {"changes": [asdict(x) for x in better.changes]}
-        args.found["improved"]["value"] = better.after.value
+        changes = [asdict(x) for x in better.changes]
+        args.found["improved"] = {"changes": changes, "value": better.after.value}
         print(better.line())
-        print(tables.table([asdict(x) for x in better.changes], digits=3))
+        print(jl.plots.table(changes, digits=3))
         found = better.after
     if args.out:
-        api.save(args.out, found.plan)
+        jl.save(args.out, found.plan)
         print(f"the plan at the record is in {args.out}")
 
 
 def atlas(args: Namespace) -> None:
     """Plan a grid once: any target between its nodes is then a few steps away."""
-    robot = robots.Robot.load(args.robot)
-    store.ensure_writable(args.out)
     axes = {"distances": args.distance_m, "heights": args.height_m}
-    build = studies.atlas.Atlas.build
-    options = given(build, args, robot=robot, folder=args.out, **axes)
-    with resumable("nodes"):
-        built = build(**options)
+    built = resumed(studies.atlas.Atlas.build, args, "nodes", folder=args.out, **axes)
     count = math.prod(map(len, axes.values()))
     args.found |= {"out": args.out, "planned": len(built.nodes), "of": count}
     if not built.nodes:
-        raise InfeasibleError(f"{robot.name} can do none of these jumps; see 'jumplab envelope'")
+        raise InfeasibleError(
+            f"{args.robot.name} can do none of these jumps; see 'jumplab envelope'"
+        )
     print(f"{built} in {args.out}; 'jumplab plan --atlas {args.out}' begins with it")
 
 
@@ -329,8 +292,7 @@ def sweep(args: Namespace) -> None:
         args.robot or ["bhr"], choices_of("--vary must be WHAT", args.vary)
     )
     cases = studies.sweep.grid(*axes, robots=names, weights=weights, method=args.method)
-    with resumable("cases"):
-        rows = studies.sweep.run(cases, **given(studies.sweep.run, args))
+    rows = resumed(studies.sweep.run, args, "cases", cases=cases)
     table = Path(args.out, studies.sweep.TABLE)
     args.found |= {"table": table, "rows": rows}
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
@@ -346,8 +308,8 @@ def bench(args: Namespace) -> None:
     benchmark = paper("planning_times")
     times = benchmark.bench(args.robot, task, args.repeats, say=tell)
     args.found |= times
-    print(tables.table(times["rows"], benchmark.COLUMNS, digits=3))
+    print(jl.plots.table(times["rows"], benchmark.COLUMNS, digits=3))
     if args.out is not None:
-        store.settle()
-        store.write_file(args.out, json.dumps(times, indent=1).encode())
+        io.folder.settle()
+        io.folder.write_file(args.out, json.dumps(times, indent=1).encode())
         print(f"raw times in {args.out}")

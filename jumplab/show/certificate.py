@@ -11,7 +11,7 @@ from jumplab.arguments import checked
 from jumplab.show.style import LANDING, VERMILION, describe_task, made_with
 from jumplab.show.tables import table
 from jumplab.show.viewer import Page
-from jumplab.studies.certify import CONDITIONS, Certificate, ModeReport
+from jumplab.studies.certify import COLUMNS, CONDITIONS, Certificate, ModeReport
 
 
 @checked
@@ -31,4 +31,4 @@ def certificate_page(certificate: Certificate) -> Page:
 
 
 def _differences(report: ModeReport) -> str:
-    return table([d.row() for d in report.differences], digits=3)._repr_html_()
+    return table(report.differences, COLUMNS, digits=3)._repr_html_()

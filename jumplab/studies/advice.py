@@ -105,7 +105,7 @@ def _records_near(robot: Robot, task: JumpTask) -> list[str]:
 def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str) -> str:
     # stage 1's limits are not the robot's
     by_steps = method == "three-step" or getattr(refusal, "stage", "") in THREE_STEPS
-    if by_steps and _refused(planner, task, "direct") is None:
+    if by_steps and refused(planner, task, "direct") is None:
         return "ask for the method 'direct', which has a plan"
     easier = task
     tried = []
@@ -115,7 +115,7 @@ def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str
             break
         tried.append(words(task, easier))
         tell(f"refused; trying {tried[-1]}")
-        refusal = _refused(planner, easier, method)
+        refusal = refused(planner, easier, method)
         if refusal is None:
             return f"ask for {tried[-1]}, which has a plan"
     if not tried:
@@ -123,7 +123,7 @@ def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str
     return f"none of the easier targets that were tried has a plan either: {'; '.join(tried)}"
 
 
-def _refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | None:
+def refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | None:
     """Why a target has no plan that passes its audit; None if it has one."""
     try:
         plan = planner.plan(task, method)

@@ -19,7 +19,7 @@ import numpy as np
 
 from jumplab import reading
 from jumplab.arguments import checked
-from jumplab.errors import InputError, SolverError, require_type
+from jumplab.errors import InputError, SolverError
 from jumplab.io.files import locked, made, write_file
 from jumplab.ocp.cache import fingerprint
 from jumplab.ocp.derivatives import parts
@@ -112,7 +112,6 @@ class Atlas:
             If the grid is empty, not rising or too large, or ``folder`` holds an atlas of something
             else.
         """
-        require_type(robot, Robot, "the robot of the atlas")
         distances = _axis("distances", distances)
         heights = _axis("heights", heights)
         if len(distances) * len(heights) > MAX_CELLS:
@@ -123,7 +122,16 @@ class Atlas:
         atlas = cls(robot.name, distances, heights, {}, key_of_plans(planner.stage("direct")))
         if folder is not None and (Path(folder) / FILE).exists():
             there = cls.load(folder)
-            there._require_grid(atlas, Path(folder) / FILE)
+            path = str(Path(folder) / FILE)
+            if there.key != atlas.key:
+                raise InputError(
+                    f"{path!r} is of robot {there.robot} with other limits, terms or mesh, not of "
+                    f"this {robot.name}; choose another folder"
+                )
+            if (there.distances, there.heights) != (atlas.distances, atlas.heights):
+                raise InputError(
+                    f"{path!r} has another grid of distances and heights; choose another folder"
+                )
             return there
 
         grid = [[JumpTask(distance, height) for distance in distances] for height in heights]
@@ -138,20 +146,6 @@ class Atlas:
         if folder is not None:
             atlas.save(folder)
         return atlas
-
-    def _require_grid(self, wanted: Atlas, path: Path) -> None:
-        """Raise :class:`InputError` unless this one, of ``path``, is of the robot and the grid that
-        are ``wanted``.
-        """
-        if self.key != wanted.key:
-            raise InputError(
-                f"{str(path)!r} is of robot {self.robot} with other limits, terms or mesh, not of "
-                f"this {wanted.robot}; choose another folder"
-            )
-        if (self.distances, self.heights) != (wanted.distances, wanted.heights):
-            raise InputError(
-                f"{str(path)!r} has another grid of distances and heights; choose another folder"
-            )
 
     # use ---------------------------------------------------------------------------------------
     def starts(self, task: JumpTask) -> list[Node]:
@@ -225,7 +219,6 @@ class Atlas:
             "key": self.key,
             "distances": self.distances,
             "heights": self.heights,
-            "done": self.heights,
             "nodes": [(n.distance_m, n.height_m, n.cost, n.limiting, n.share) for n in nodes],
         }
         buffer = io.BytesIO()
@@ -239,7 +232,7 @@ class Atlas:
     @classmethod
     def load(cls, folder: str | Path) -> Atlas:
         """The atlas of a ``folder`` (that of :meth:`save`); raises :class:`InputError` if there is
-        none, or it is damaged or unfinished.
+        none, or it is damaged.
         """
         path = Path(folder) / FILE
         try:
@@ -248,8 +241,6 @@ class Atlas:
             rows = file["rows"]
             if head["format"] != FORMAT or not np.all(np.isfinite(rows)):
                 raise ValueError("other format, or numbers that are none")
-            if len(head["done"]) < len(head["heights"]):
-                raise ValueError("unfinished")
             nodes = [Node(*node, x) for node, x in zip(head["nodes"], rows, strict=True)]
             places = {(node.distance_m, node.height_m): node for node in nodes}
             return cls(head["robot"], head["distances"], head["heights"], places, head["key"])

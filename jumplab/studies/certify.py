@@ -71,62 +71,10 @@ QUANTITIES = tuple(Quantity(**x) for x in TABLE["quantities"])
 AWAY = tuple(Quantity(**x) for x in TABLE["away"])  # of a jump out of the plane, besides
 
 
-@dataclass(frozen=True)
-class Difference:
-    """One quantity in all engines."""
-
-    quantity: Quantity
-    values: dict[str, float | None]  # of the robot as planned, by engine
-    apart: float | None  # of that; None where a jump did not get so far
-    limit: float
-    # median and largest of perturbed robots that came down in all engines, if there are any
-    spread: dict[str, float] | None
-
-    @property
-    def within(self) -> bool:
-        """True if the engines agree on the robot as planned."""
-        return self.apart is not None and self.apart <= self.limit
-
-    @property
-    def failures(self) -> list[str]:
-        """Why the engines do not agree, in sentences."""
-        q = self.quantity
-        sentences = []
-        if self.apart is None:
-            sentences.append(f"{q.name} was not measured in every engine")
-        elif not self.within:
-            sentences.append(
-                f"the engines are {q.with_unit(self.apart)} apart in {q.name}, at most "
-                f"{q.with_unit(self.limit)}"
-            )
-        if self.spread and (middle := self.spread["median"]) > self.limit:
-            sentences.append(
-                f"perturbed robots are {q.with_unit(middle)} apart in {q.name} (median), at most "
-                f"{self.limit:.3g}"
-            )
-        return sentences
-
-    def row(self) -> Plain:
-        """A line of a table: in each engine, how far apart, and at most; then how far perturbed
-        robots are.
-        """
-        q = self.quantity
-        spread = self.spread or {}
-        return {
-            "as planned": f"{q.name}{', share' if q.relative else f' [{q.unit}]'}",
-            **self.values,
-            "apart": self.apart,
-            "at most": self.limit,
-            "agree": self.within,
-            "robots, median": spread.get("median"),
-            "largest": spread.get("largest"),
-        }
-
-    def to_json(self) -> Plain:
-        """Plain data, in SI units."""
-        q = self.quantity
-        verdict = dict(apart=self.apart, limit=self.limit, within=self.within)
-        return dict(name=q.name, unit=q.unit, relative=q.relative, **self.values, **verdict)
+# of a table of differences, by their keys
+COLUMNS = {"name": "as planned", "unit": "unit"} | {engine: engine for engine in ENGINES}
+COLUMNS |= {"apart": "apart", "relative": "of the mean", "limit": "at most", "within": "agree"}
+COLUMNS |= {"median": "robots, median", "largest": "largest"}
 
 
 @dataclass(frozen=True)
@@ -139,18 +87,36 @@ class ModeReport:
     pairs: tuple[dict[str, Trial], ...]  # every perturbed robot's jump by engine
     in_plane: bool  # whether the jump stays there
 
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What is compared."""
+        return QUANTITIES if self.in_plane else (*QUANTITIES, *AWAY)
+
     @cached_property
-    def differences(self) -> list[Difference]:
-        """One per quantity."""
-        differences = []
-        for q in (*QUANTITIES, *(() if self.in_plane else AWAY)):
-            values = {engine: q.of(trial) for engine, trial in self.planned.items()}
+    def differences(self) -> list[Plain]:
+        """A row per quantity, by the keys of :data:`COLUMNS`: of the robot as planned in each
+        engine, how far apart (None where a jump did not get so far), and at most; then median and
+        largest of perturbed robots that came down in all engines, if there are any.
+        """
+        rows = []
+        for q in self.quantities:
             every = (q.apart(pair.values()) for pair in self.pairs)
             others = [x for x in every if x is not None]
-            spread = others and {"median": float(np.median(others)), "largest": max(others)}
             apart = q.apart(self.planned.values())
-            differences.append(Difference(q, values, apart, LIMITS[q.limit], spread or None))
-        return differences
+            limit = LIMITS[q.limit]
+            row = {
+                "name": q.name,
+                "unit": q.unit,
+                "relative": q.relative,
+                **{engine: q.of(trial) for engine, trial in self.planned.items()},
+                "apart": apart,
+                "limit": limit,
+                "within": apart is not None and apart <= limit,
+                "median": float(np.median(others)) if others else None,
+                "largest": max(others, default=None),
+            }
+            rows.append(row)
+        return rows
 
     @property
     def unlike(self) -> dict[int, dict[str, Trial]]:
@@ -179,8 +145,19 @@ class ModeReport:
             for engine, t in self.planned.items()
             if not t.landed
         ]
-        for difference in self.differences:
-            sentences += difference.failures
+        for q, row in zip(self.quantities, self.differences, strict=True):
+            if row["apart"] is None:
+                sentences.append(f"{q.name} was not measured in every engine")
+            elif not row["within"]:
+                sentences.append(
+                    f"the engines are {q.with_unit(row['apart'])} apart in {q.name}, at most "
+                    f"{q.with_unit(row['limit'])}"
+                )
+            if (row["median"] or 0.0) > row["limit"]:
+                sentences.append(
+                    f"perturbed robots are {q.with_unit(row['median'])} apart in {q.name} "
+                    f"(median), at most {row['limit']:.3g}"
+                )
         if self.same < LIMITS["verdict_share"] * len(self.pairs):
             sentences.append(
                 f"{self.same} of {len(self.pairs)} perturbed robots fare alike, at least "
@@ -192,18 +169,21 @@ class ModeReport:
         """Plain data, in SI units."""
         robots = []
         for k, pair in enumerate(self.pairs):
-            apart = {d.quantity.name: d.quantity.apart(pair.values()) for d in self.differences}
+            apart = {q.name: q.apart(pair.values()) for q in self.quantities}
             row = {"number": k, "same": k not in self.unlike, "apart": apart}
             robots.append(row | _verdicts(pair))
         return {
             "as_planned": _verdicts(self.planned),
-            "differences": [d.to_json() for d in self.differences],
+            "differences": self.differences,
             "perturbed": {
                 "conditions": CONDITIONS,
                 "count": len(self.pairs),
                 "landed": self.landed,
                 "same_verdict": self.same,
-                "apart": {d.quantity.name: d.spread for d in self.differences},
+                "apart": {
+                    row["name"]: {key: row[key] for key in ("median", "largest")}
+                    for row in self.differences
+                },
                 "robots": robots,
             },
         }

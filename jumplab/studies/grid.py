@@ -47,6 +47,13 @@ COLUMNS = (
 )
 
 
+def role_of(robot: Robot, joint: str) -> str:
+    """What a joint does in words, on either side: its role, or its name if it has none."""
+    roles = {name: role for role, pair in robot.joints.items() for name in pair}
+    word = roles.get(joint, joint).removeprefix("left_").removeprefix("right_")
+    return word.replace("_", " ")
+
+
 def most_used(report: AuditReport, robot: Robot) -> tuple[str, float]:
     """What a plan uses most of what its robot has, torque at its speed, speed or friction, and the
     share of it [1].
@@ -54,15 +61,13 @@ def most_used(report: AuditReport, robot: Robot) -> tuple[str, float]:
     A joint with a role is named by it.
     """
     shares = []
-    roles = {joint: role for role, pair in robot.joints.items() for joint in pair}
     for check in report.checks:
         if what := USES.get(check.name):
             worst = check.note.rpartition("; worst: ")[2]
-            joint = roles.get(worst, worst).removeprefix("left_").removeprefix("right_")
-            name = what if what == "friction" else f"{joint} {what}"
+            name = what if what == "friction" else f"{role_of(robot, worst)} {what}"
             shares.append((check.value / check.limit, name))
     share, name = max(shares)
-    return name.replace("_", " "), float(share)
+    return name, float(share)
 
 
 def plan_cell(

@@ -7,14 +7,14 @@ again. A number whose price changes its sign is moved by less.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumplab.arguments import real
+from jumplab.arguments import fitting
 from jumplab.errors import InputError, RobotError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
@@ -96,16 +96,8 @@ class Improved(Shown):
         )
 
 
-@dataclass(frozen=True)
-class _Free:
-    """A number that may change, in shares of what it is: 1 at first."""
-
-    number: str
-    unit: str
-    key: Any  # what it belongs to, of a gear or a mass
-    size: float
-    low: float
-    high: float
+# the numbers that may change, by their sort, and joint, role or links that they belong to
+Free = Mapping[tuple[str, Any], Change]
 
 
 def improve(record: Record, free: Mapping[str, Any], budget: int = 6) -> Improved:
@@ -120,19 +112,15 @@ def improve(record: Record, free: Mapping[str, Any], budget: int = 6) -> Improve
     if after.value < record.value:
         after, shares, buys = record, np.ones(len(numbers)), 0 * buys
     rows = [
-        Change(
-            x.number, x.unit, x.low * x.size, x.high * x.size, x.size, float(s * x.size), float(b)
-        )
-        for x, s, b in zip(numbers, shares, buys, strict=True)
+        replace(x, after=float(s * x.before), buys=float(b))
+        for x, s, b in zip(numbers.values(), shares, buys, strict=True)
     ]
     return Improved(record, after, tuple(sorted(rows, key=lambda x: -x.buys)))
 
 
-def _climbed(
-    record: Record, numbers: Sequence[_Free], budget: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _climbed(record: Record, numbers: Free, budget: int) -> tuple[np.ndarray, np.ndarray]:
     """Shares of the numbers (n,) with the largest record, and what each bought (n,)."""
-    low, high = np.array([(x.low, x.high) for x in numbers]).T
+    low, high = np.array([(x.low / x.before, x.high / x.before) for x in numbers.values()]).T
     shares = np.ones(len(numbers))
     buys = np.zeros(len(numbers))
     steps = np.full(len(numbers), STEP)
@@ -143,15 +131,15 @@ def _climbed(
     for _ in range(budget):
         if prices is None:
             pricer = Pricer(program, asked.task, solved)
-            prices = np.array(
-                [_price(pricer, record, numbers, shares, k) for k in range(len(numbers))]
-            )
+            each = (_price(pricer, record, numbers, shares, k) for k in range(len(numbers)))
+            prices = np.array(list(each))
             steps = np.where(before * prices < 0, steps / 2, steps)
             before = np.sign(prices)
         moved = np.clip(shares * (1 + before * steps), low, high)
         if np.abs(moved / shares - 1).max() < SMALLEST:
             break
-        tell(f"record with {_words(numbers, moved)}")
+        each = zip(numbers.values(), moved, strict=True)
+        tell(f"record with {', '.join(f'{x.number} {s * x.before:.3g}' for x, s in each)}")
         found = None
         with suppress(RobotError):
             other = program.like(_changed(record.plan.robot, numbers, moved))
@@ -167,9 +155,7 @@ def _climbed(
     return shares, buys
 
 
-def _price(
-    pricer: Any, record: Record, numbers: Sequence[_Free], shares: np.ndarray, k: int
-) -> float:
+def _price(pricer: Any, record: Record, numbers: Free, shares: np.ndarray, k: int) -> float:
     """What a number buys per share of it [m, rad]."""
     for step in (PROBE, -PROBE):
         moved = shares.copy()
@@ -180,20 +166,16 @@ def _price(
     return 0.0
 
 
-def _words(numbers: Sequence[_Free], shares: np.ndarray) -> str:
-    return ", ".join(f"{x.number} {s * x.size:.3g}" for x, s in zip(numbers, shares, strict=True))
-
-
 # the numbers
 # ----------------------------------------------------------------------------------------------
-def _numbers(robot: Robot, free: Mapping[str, Any]) -> list[_Free]:
+def _numbers(robot: Robot, free: Mapping[str, Any]) -> Free:
     """What may change; refuses (:class:`InputError`) what is no number of the robot."""
     kinds = ("gear", *PARTS, "mass_kg")
-    if not (isinstance(free, Mapping) and free and set(free) <= set(kinds)):
+    if not free or set(free) - set(kinds):
         raise InputError(
             f"free = {quoted(free)}: give what may change as a mapping, of {', '.join(kinds)}"
         )
-    out = []
+    out = {}
     for kind, given in free.items():
         if kind == "gear":
             rows = given if isinstance(given, Mapping) else dict.fromkeys(_listed(given), GEARS)
@@ -213,7 +195,7 @@ def _numbers(robot: Robot, free: Mapping[str, Any]) -> list[_Free]:
             if not low <= size <= high:
                 raise InputError(f"{word} is {size:.4g}, outside of its ends {low:g} ... {high:g}")
             unit = "" if kind == "gear" else kind.rpartition("_")[2]
-            out.append(_Free(word, unit, key, size, low / size, high / size))
+            out[kind, key] = Change(word, unit, low, high, size, size, 0.0)
     _changed(robot, out, np.full(len(out), 1 + 1e-6))  # refuses names that the robot lacks
     return out
 
@@ -225,9 +207,7 @@ def _listed(given: Any) -> list:
 
 
 def _ends(word: str, ends: Any) -> tuple[float, float]:
-    if not isinstance(ends, list | tuple) or len(ends) != 2:
-        raise InputError(f"the ends of {word} are (low, high), got {quoted(ends)}")
-    low, high = (real(x, f"an end of {word}") for x in ends)
+    low, high = fitting(ends, tuple[float, float], f"the ends of {word}")
     if not 0 < low < high:
         raise InputError(f"the ends of {word} must be positive and in order, got {quoted(ends)}")
     return low, high
@@ -242,16 +222,14 @@ def _mass(robot: Robot, link: Any) -> float:
     return round((heavier.total_mass - robot.total_mass) / count, 9)
 
 
-def _changed(robot: Robot, numbers: Sequence[_Free], shares: np.ndarray) -> Robot:
+def _changed(robot: Robot, numbers: Free, shares: np.ndarray) -> Robot:
     """The robot with its numbers at these ``shares`` (n,) of what they are."""
-    moved = {x.number: (x, float(s)) for x, s in zip(numbers, shares, strict=True) if s != 1}
-    gears = {x.key: s for x, s in moved.values() if x.number.startswith("gear")}
-    legs = {name: s for name, (x, s) in moved.items() if x.unit == "m"}
+    moved = [(*key, float(s)) for key, s in zip(numbers, shares, strict=True) if s != 1]
+    gears = {key: s for kind, key, s in moved if kind == "gear"}
+    legs = {kind.removesuffix("_m"): s for kind, _, s in moved if kind in PARTS}
     robot = robot.with_gears(gears) if gears else robot
     robot = robot.with_legs(**legs) if legs else robot
-    for x, share in moved.values():
-        if x.unit == "kg":
-            robot = robot.with_mass(
-                list(x.key) if isinstance(x.key, tuple) else x.key, factor=share
-            )
+    for kind, key, share in moved:
+        if kind == "mass_kg":
+            robot = robot.with_mass(list(key) if isinstance(key, tuple) else key, factor=share)
     return robot

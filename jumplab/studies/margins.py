@@ -17,7 +17,7 @@ from jumplab.arguments import checked
 from jumplab.errors import InputError, Shown, quoted
 from jumplab.io import folder as store
 from jumplab.io.progress import tell
-from jumplab.sim import Ranges
+from jumplab.sim import Ranges, is_pair
 from jumplab.studies.study import Plain, check_numbers
 from jumplab.studies.trials import PlanOnFile, TrialSettings, wilson
 
@@ -26,7 +26,9 @@ NAME = "margins.json"
 Probe = tuple[float, int, int]  # share of the limits, robots that landed, robots tried
 WANTED = 0.95  # share of robots that shall land
 STEPS = 4  # of the bisection: to a sixteenth of the largest size
-SINGLE = tuple(f.name for f in fields(Ranges))
+# of each disturbance, in the unit of its name; friction falls
+LIMITS = {f.name: f.metadata["least" if f.name == "friction" else "most"] for f in fields(Ranges)}
+SINGLE = tuple(LIMITS)
 PAIRS = ("payload_kg+friction", "ground_m+ground_tilt_deg", "shove_flight_n_s+delay_s")
 
 
@@ -38,25 +40,22 @@ def ranges_at(names: str, share: float) -> Ranges:
     middle is known, are drawn up to there. Friction falls. Raises :class:`InputError` for names
     that :class:`Ranges` lacks.
     """
-    known = {f.name: f for f in fields(Ranges)}
     ranges = {}
     for name in names.split("+"):
-        if name not in known:
+        if name not in LIMITS:
             raise InputError(
-                f"no disturbance is called {quoted(name)}; there are {', '.join(known)}"
+                f"no disturbance is called {quoted(name)}; there are {', '.join(LIMITS)}"
             )
         size = _size(name, share)
-        pair = isinstance(known[name].default, tuple)
-        ranges[name] = (0.0 if name == "delay_s" else size, size) if pair else size
+        ranges[name] = (0.0 if name == "delay_s" else size, size) if is_pair(name) else size
     return Ranges.none(**ranges)
 
 
 def _size(name: str, share: float) -> float:
     """A disturbance's size at a share of the way from nothing to its limit, in its own unit."""
-    limit = next(f.metadata for f in fields(Ranges) if f.name == name)
     nothing = getattr(Ranges.none(), name)
-    nothing = nothing[0] if isinstance(nothing, tuple) else nothing
-    return (1 - share) * nothing + share * limit["least" if name == "friction" else "most"]
+    nothing = nothing[0] if is_pair(name) else nothing
+    return (1 - share) * nothing + share * LIMITS[name]
 
 
 @dataclass(frozen=True)
@@ -180,9 +179,8 @@ def margins(
             tell(f"margin of {name}", number, 2 * len(names))
             best, probes = _largest(partial(probe, name, reaim), n, steps)
             margins.append(Margin(name, reaim, *best, tuple(probes)))
-    target = dict(plan.summary["target"])
-    ways = settings.step, settings.feedback
-    report = MarginReport(tuple(margins), settings.engine, n, target, *ways)
+    where = settings.engine, n, dict(plan.summary["target"]), settings.step, settings.feedback
+    report = MarginReport(tuple(margins), *where)
     plan.write(NAME, report.to_json())
     return report
 

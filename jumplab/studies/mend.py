@@ -209,10 +209,10 @@ def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended
     return Mended(plan, before, rows, _binding(plan), factor, draft.span_s)
 
 
-def spans(flags: np.ndarray) -> list[tuple[int, int]]:
+def spans(flags: np.ndarray) -> list[list[int]]:
     """First row, and the row after the last one, of each run of true ``flags`` (n,)."""
     edges = np.flatnonzero(np.diff(np.asarray(flags, int), prepend=0, append=0))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    return edges.reshape(-1, 2).tolist()
 
 
 # the schedule
@@ -233,7 +233,7 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             ground[a:b] = ~one if steps else False
     rows = _merged(phases_of(ground, fps))
     standing = [k for k, row in enumerate(rows) if row[0] == "LR"]
-    if not standing or rows[standing[-1]][0] == FLIGHT:
+    if not standing:
         raise InputError(
             f"clip {before.clip.name!r}: it never stands on both feet, and a motion has to begin "
             f"so; give more of it"
@@ -241,7 +241,7 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
     # between long standing the motion that flies longest, else that of most phases
     long = [k for k in standing[1:-1] if rows[k][2] - rows[k][1] > LONG_S]
     ends = pairwise([standing[0], *long, standing[-1]])
-    parts = [[list(row) for row in rows[a : b + 1]] for a, b in ends] or [rows[standing[0] :]]
+    parts = [rows[a : b + 1] for a, b in ends]
     rows = max(parts, key=lambda x: (sum(b - a for f, a, b in x if f == FLIGHT), len(x)))
     if len(rows) > 1:
         rows[0][1] = max(rows[0][1], rows[0][2] - _standing_s(before, rows[0][2], -1))
@@ -331,7 +331,7 @@ class Draft:
                 f"clip {self.clip.name!r}: its feet carry as {' '.join(feet)}; a jump to a target "
                 f"is like one that flies once, off both feet and down on both"
             )
-        stood, middle = (self._middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
+        stood, middle = (self.middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
         turn = goal.yaw_rad - (middle[2] - stood[2])
         way = np.add(stood[:2], [goal.distance_m, goal.side_m])
         back = pin.rpy.rpyToMatrix(0.0, 0.0, turn)[:2, :2].T
@@ -353,7 +353,7 @@ class Draft:
             for side, place in hold.items():
                 hold[side] = np.array([*there(place[:2]), 0.0, place[3] + turn])
 
-    def _middle(self, hold: dict[int, np.ndarray]) -> np.ndarray:
+    def middle(self, hold: dict[int, np.ndarray]) -> np.ndarray:
         """x, y of the middle between the soles in their places [m], and their mean yaw [rad]."""
         half = self.body.half_m
         soles = [[x - half * np.cos(a), y - half * np.sin(a), a] for x, y, _, a in hold.values()]
@@ -394,15 +394,18 @@ class Draft:
         places = []
         phases = []
         for k, (feet, a, b) in enumerate(self.phases):
-            lasts = (b - a) * (math.sqrt(factor) if feet == FLIGHT else 1.0)
-            if self.goal and feet == FLIGHT:
-                lasts = 2 * self.goal.takeoff_speed / self.goal.gravity
-            low, high = (lasts * x for x in (FLIGHT_STRETCH if feet == FLIGHT else STRETCH))
+            lasts = b - a
             if feet == FLIGHT:
+                kind = FLIGHT
+                lasts *= math.sqrt(factor)
+                if self.goal:
+                    lasts = 2 * self.goal.takeoff_speed / self.goal.gravity
+                low, high = (lasts * x for x in FLIGHT_STRETCH)
                 high = max(high, SHORT_FLIGHT_S)
-            kind = feet if feet == FLIGHT else "toe" if feet.islower() else "flat"
-            if k and kind == "flat" and self.holds[k].keys() - self.holds[k - 1].keys():
-                kind = "landing"
+            else:
+                lands = k and self.holds[k].keys() - self.holds[k - 1].keys()
+                kind = "toe" if feet.islower() else "landing" if lands else "flat"
+                low, high = (lasts * x for x in STRETCH)
             steps = min(MOST_STEPS, max(LEAST_STEPS, math.ceil(lasts / STEPS_S[kind])))
             phases.append(ContactPhase(feet, (low, high), lasts, steps))
             for side, hold in self.holds[k].items():
@@ -556,11 +559,11 @@ def _changes(before: ClipReport, draft: Draft, plan: JumpPlan) -> list[dict[str,
     pairs = zip(phases, plan.contacts.phases, strict=True)
     times_s = [x.duration for x, contact in pairs if contact.flying]
     com = plan.tape.extra["com"][:, 2]
-    flights = spans(~(plan.tape.extra["contacts"] > 0).any(axis=1))
     rises_m = [flight["rise_m"] for flight in before.manifest["flights"]]
+    risen_m = [com[x].max() - com[x.start] for x in plan.tape.flights]
     both = {
         "flight {} [s]": zip(flown_s, times_s, strict=True),
-        "rise {} [m]": zip(rises_m, (com[a:b].max() - com[a] for a, b in flights), strict=False),
+        "rise {} [m]": zip(rises_m, risen_m, strict=False),
     }
     for what, values in both.items():
         for i, (clip, mended) in enumerate(values, 1):

@@ -20,6 +20,7 @@ from jumplab.stages.whole_body.program import Program, Solved
 from jumplab.stages.whole_body.starts import RECORD, Asked, from_solved
 from jumplab.stages.whole_body.terms import FAR, TORQUE_SPEED, WORTH
 from jumplab.stages.whole_body.terms import RECORD as RECORD_TERM
+from jumplab.studies.grid import role_of
 from jumplab.task import JumpTask
 
 if TYPE_CHECKING:
@@ -110,14 +111,11 @@ def _moves(record: Record, most: int) -> Iterator[_Move]:
     limits = record.program.limits
     motors = robot.actuators
     kinds = {"torque": ("torque",), "speed": ("speed",), TORQUE_SPEED: ("torque", "speed")}
-    pairs = {}
-    for row in record.limits:
-        for kind in kinds.get(row.limit, (row.limit,)):
-            if row.joint in motors:
-                pairs.setdefault((kind, row.joint))
-    for kind, joint in list(pairs)[:most]:
+    pairs = [(kind, x.joint) for x in record.limits for kind in kinds.get(x.limit, (x.limit,))]
+    pairs = [pair for pair in dict.fromkeys(pairs) if pair[1] in motors]
+    for kind, joint in pairs[:most]:
         signs = _both(record.program, joint)
-        word = f"{_role(robot, joint)} {kind}"
+        word = f"{role_of(robot, joint)} {kind}"
         if kind in STOPS:
             way = STOPS[kind]
             ranges = {
@@ -145,12 +143,6 @@ def _both(program: Program, joint: str) -> dict[str, int]:
     names = program.body.model.names
     column = program.free.spread[:, program.free.free_names.index(joint)]
     return {names[k]: int(np.sign(column[k])) for k in np.flatnonzero(column)}
-
-
-def _role(robot: Robot, joint: str) -> str:
-    roles = {name: role for role, pair in robot.joints.items() for name in pair}
-    word = roles.get(joint, joint).removeprefix("left_").removeprefix("right_")
-    return word.replace("_", " ")
 
 
 class Pricer:

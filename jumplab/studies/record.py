@@ -92,7 +92,7 @@ class Record(Shown):
     plan, audit : a plan at the record, and its audit.
     found : by the easy jump that each start was, the number in which it ended; nan for none.
     limits : what ends it, the dearest first.
-    share, reserve, runs : a plan at this share of the record, played in each engine.
+    share, runs : of a plan at this share of the record, played in each engine.
     asked : the rest of what was asked for, as arguments of :func:`record`.
     """
 
@@ -104,7 +104,6 @@ class Record(Shown):
     found: Mapping[str, float]
     limits: tuple[Binding, ...]
     share: float
-    reserve: JumpPlan | None
     runs: Mapping[str, SimulationResult]
     program: Program
     solved: Solved
@@ -118,7 +117,7 @@ class Record(Shown):
     @property
     def best(self) -> float:
         """The largest number at the nodes, of all starts [m, rad]."""
-        return max(x for x in self.found.values() if x == x)
+        return float(np.nanmax(list(self.found.values())))
 
     @property
     def alike(self) -> int:
@@ -224,13 +223,13 @@ def record(
         search = _Search(planner, what, given)
         found, best = search.from_easy()
         plan, solved, program = search.plan_at(best)
-        share, reserve, runs = search.played(plan, share, engines)
+        share, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
     bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
     if given is None and not changes:
         keep_record(robot, what, value)
-    made = plan, plan.audit, found, ends, share, reserve, runs
+    made = plan, plan.audit, found, ends, share, runs
     asked = {"given": given, "share": share, "engines": engines, **changes}
     return Record(what, value, bound, *made, program, solved, asked)
 
@@ -356,25 +355,24 @@ class _Search:
 
     def played(
         self, plan: JumpPlan, share: float, engines: Sequence[str]
-    ) -> tuple[float, JumpPlan | None, dict[str, SimulationResult]]:
+    ) -> tuple[float, dict[str, SimulationResult]]:
         """A plan at a ``share`` [1] of the record, played in all ``engines``: of several shares,
         each :data:`LESS` than the one before, the first that lands in all, else the last one.
         """
-        reserve = None
         runs: dict[str, SimulationResult] = {}
-        for less in range(TRIED if len(engines) else 0):
+        task = plan.task
+        for less in range(TRIED if engines else 0):
             tried = share - LESS * less
             tell(f"playing {tried:.0%} of the record")
-            near = reserve or plan
             with suppress(InfeasibleError, SolverError):
-                reserve = self.planner.plan(self.at(plan.task, tried), "direct", near=near)
-                scene = Scene.of_plan(reserve.summary, reserve.robot)
-                given = reserve.tape, reserve.robot
+                plan = self.planner.plan(self.at(task, tried), "direct", near=plan)
+                scene = Scene.of_plan(plan.summary, plan.robot)
+                given = plan.tape, plan.robot
                 runs = {x: simulate_jump(*given, scene=scene, engine=x) for x in engines}
                 share = tried
                 if all(run.landed for run in runs.values()):
                     break
-        return share, reserve, runs
+        return share, runs
 
 
 def unit_of(name: str) -> str:

@@ -20,7 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from jumplab.errors import InputError, require_type
+from jumplab.errors import InputError
 from jumplab.models.spatial import SpatialModel, cross
 from jumplab.ocp import Term
 from jumplab.robot import Robot
@@ -57,9 +57,8 @@ def robust_changes(
     differs (delay, motors, ground, shoves, sensors, posture) is not seen: it does not depend on the
     plan's masses or limits. Own limits win.
 
-    Raises :class:`InputError` if ``ranges`` are none, or have nothing that a plan can allow for.
+    Raises :class:`InputError` if ``ranges`` have nothing that a plan can allow for.
     """
-    require_type(ranges, Ranges, "robust: how far robots differ")
     nothing = Ranges.none()
     if all(getattr(ranges, name) == getattr(nothing, name) for name in (*MOVING, *LIMITING)):
         raise InputError(

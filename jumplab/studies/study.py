@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -79,17 +80,19 @@ def check_numbers(n: int, seed: int, jobs: int | None) -> None:
 
 
 # the study -------------------------------------------------------------------------------------
+@dataclass
 class Study:
-    """A study at work; made by :func:`open_study`."""
+    """A study at work; made by :func:`open_study`, which says what its parts are."""
 
-    def __init__(self, log: Log | None, bar: tqdm, kind: type | None, jobs: int | None):
-        self._log = log
-        self._bar = bar
-        self._kind = kind
-        self._jobs = jobs
+    log: Log | None
+    bar: tqdm
+    kind: type | None
+    jobs: int | None
+    resumed: int = 0  # cases that an earlier run had done
+
+    def __post_init__(self):
         self._count = 0
-        self.done: dict[str, Any] = {} if log is None else log.done  # by key
-        self.resumed = 0  # cases that an earlier run had done
+        self.done: dict[str, Any] = {} if self.log is None else self.log.done  # by key
 
     def results(self, work: Mapping[str, Task]) -> list[Any]:
         """Do what the log does not have of ``work`` (tasks by key); all results, in its order."""
@@ -98,21 +101,21 @@ class Study:
         ]
         self.resumed += len(work) - len(missing)
         self._advance(len(work) - len(missing))
-        for name, result in in_parallel(missing, self._jobs):
-            row = result if self._kind is None else result.to_json()
+        for name, result in in_parallel(missing, self.jobs):
+            row = result if self.kind is None else result.to_json()
             row = json.loads(json.dumps(row))  # the very one that a resumed run reads
-            if self._log is not None:
-                self._log.add({"key": name, "row": row})
-            self.done[name] = row if self._kind is None else self._kind.from_json(row)
+            if self.log is not None:
+                self.log.add({"key": name, "row": row})
+            self.done[name] = row if self.kind is None else self.kind.from_json(row)
             self._advance(1)
         return [self.done[name] for name in work]
 
     def _advance(self, cases: int) -> None:
         self._count += cases
-        self._bar.update(cases)
-        self._bar.refresh()
-        if self._bar.total:
-            tell("done", self._count, self._bar.total)
+        self.bar.update(cases)
+        self.bar.refresh()
+        if self.bar.total:
+            tell("done", self._count, self.bar.total)
 
 
 @contextmanager

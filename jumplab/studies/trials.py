@@ -52,8 +52,6 @@ from jumplab.task import JumpTask
 SCHEMA = "jumplab-trials-1"
 NAME = "trials.jsonl"
 CONFIDENCE = 0.95
-# what logs of earlier versions say of runs that fail their checks, and what is said now
-OLDER = ("not honest: ", "failed checks of the run: ")
 # what is corrected: without, with
 LAUNCH = (
     "open loop on two feet; on one, CoM and angular momentum are led back to the plan",
@@ -153,10 +151,10 @@ class TrialSettings:
 
     def simulate(self, plan: PlanOnFile, drawn: Perturbation, **options: Any) -> SimulationResult:
         """The jump of a ``drawn`` robot; ``options`` as of :func:`jumplab.sim.simulate_jump`."""
-        for name in ("mode", "reaim", "step", "feedback", "engine", "contact"):
-            options[name] = getattr(self, name)
-        if not self.feedback:
-            del options["feedback"]  # on one foot, without being asked
+        names = ["mode", "reaim", "step", "engine", "contact"]
+        if self.feedback:  # on one foot also without being asked
+            names.append("feedback")
+        options |= {name: getattr(self, name) for name in names}
         options |= {"scene": plan.scene, "perturbation": drawn}
         return simulate_jump(plan.tape, plan.robot, **options)
 
@@ -217,7 +215,6 @@ class Trial:
         if (metrics := data["metrics"]) is not None:
             lists = {k: tuple(v) for k, v in metrics.items() if isinstance(v, list)}
             data["metrics"] = Metrics(**metrics | lists)
-        data["reason"] = data["reason"].replace(*OLDER)
         data["key"] = TrialKey(**data["key"])
         data["signs"] = tuple(Sign(**sign) for sign in data["signs"])
         return cls(**data)
@@ -255,7 +252,7 @@ def judged(
         return result.landed, result.reason, result.metrics, signs(result)
     failed = [str(finding) for finding in result.checks if not finding.passed]
     doubts = "; ".join(failed) or "nothing was checked"
-    reason = f"{OLDER[1]}{doubts}; the run's own verdict: {result.reason}"
+    reason = f"failed checks of the run: {doubts}; the run's own verdict: {result.reason}"
     return False, reason, result.metrics, ()
 
 
@@ -400,8 +397,8 @@ class TrialReport(Shown):
 
 def wilson(landed: int, count: int) -> tuple[float, float]:
     """Wilson's 95 % interval (low, high) of a success rate [1]."""
-    interval = binomtest(landed, count).proportion_ci(CONFIDENCE, method="wilson")
-    return float(interval.low), float(interval.high)
+    low, high = binomtest(landed, count).proportion_ci(CONFIDENCE, method="wilson")
+    return float(low), float(high)
 
 
 @checked

@@ -4,15 +4,15 @@ belongs to it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, RobotError, quoted
+from jumplab.arguments import checked
+from jumplab.errors import InputError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.stance import check_stance
 from jumplab.sim.scene import Scene
@@ -65,37 +65,38 @@ class Course:
     tasks: tuple[JumpTask, ...]
 
     @classmethod
+    @checked
     def of(
         cls,
-        distances_m: Iterable[Any],
-        height_m: Any,
-        platforms_m: Iterable[Any] | None = None,
-        sides_m: Iterable[Any] | None = None,
-        turns_rad: Iterable[Any] | None = None,
+        distances_m: Sequence[float],
+        height_m: float | Sequence[float],
+        platforms_m: Sequence[float] | None = None,
+        sides_m: Sequence[float] | None = None,
+        turns_rad: Sequence[float] | None = None,
     ) -> Course:
-        """A course from what somebody typed, (K,) each [m, rad]: one height for all jumps or one
+        """A course of K jumps from numbers of each [m, rad]: one height for all jumps or one
         per jump; platforms above the first ground, else level; straight ahead without sides and
         turns.
 
         Raises :class:`InputError` if there is no jump, if lists differ in length, or if a number
         cannot be meant.
         """
-        distances = _numbers("distances", distances_m)
-        count = len(distances)
+        count = len(distances_m)
         if not 1 <= count <= MOST_JUMPS:
             raise InputError(
                 f"a chain has 1 ... {MOST_JUMPS} jumps, this one has {count}; "
                 f"give one distance per jump"
             )
-        heights = _numbers("heights", [height_m] if np.ndim(height_m) == 0 else height_m)
-        rows = {"heights": heights * count if len(heights) == 1 else heights}
+        heights = np.atleast_1d(height_m).tolist()
+        heights = heights * count if len(heights) == 1 else heights
         given = {"platforms": platforms_m, "sides": sides_m, "turns": turns_rad}
-        for name, values in given.items():
-            rows[name] = [0.0] * count if values is None else _numbers(name, values)
+        rows = {"heights": heights} | {
+            name: [0.0] * count if x is None else x for name, x in given.items()
+        }
         for name, values in rows.items():
             if len(values) != count:
                 raise InputError(f"{len(values)} {name} for {count} distances: give one per jump")
-        if any(rows["platforms"]) and any(rows["sides"] + rows["turns"]):
+        if any(rows["platforms"]) and any([*rows["sides"], *rows["turns"]]):
             raise InputError(
                 "platforms lie on a straight way: leave them away, "
                 "or ask for neither sides nor turns"
@@ -103,7 +104,8 @@ class Course:
         # above the surface that each jump starts from
         rows["platforms"] = np.diff(rows["platforms"], prepend=0.0).round(9).tolist()
         tasks = []
-        for k, (*numbers, side, turn) in enumerate(zip(distances, *rows.values(), strict=True), 1):
+        jumps = zip(distances_m, *rows.values(), strict=True)
+        for k, (*numbers, side, turn) in enumerate(jumps, 1):
             try:
                 tasks.append(JumpTask(*numbers, side_m=side, yaw_rad=turn))
             except InputError as e:
@@ -194,17 +196,3 @@ class Course:
         zero = robot.foot.toe - float(robot.foot.center[0])  # soles' middle at x = 0
         tops = {zero + x: top for x, top in self.edges(robot)}
         return Scene.level("platforms", tops) if tops else Scene.flat()
-
-
-def _numbers(name: str, values: Any) -> list[float]:
-    if isinstance(values, str) or not isinstance(values, Iterable):
-        raise InputError(f"the {name} of a chain must be a list of numbers, got {quoted(values)}")
-    numbers = []
-    for k, value in enumerate(values, 1):
-        try:
-            numbers.append(float("" if isinstance(value, bool) else value))
-        except (TypeError, ValueError, OverflowError):
-            raise InputError(
-                f"the {name} of a chain must be numbers in m; number {k} is {quoted(value)}"
-            ) from None
-    return numbers

@@ -115,6 +115,7 @@ class Ahead:
         return self.plan is not None and self.spare_s is not None and self.spare_s >= 0
 
 
+@dataclass
 class Foresight:
     """Plans the next jump of a course from measurements, and remembers what the robot's jumps
     taught.
@@ -122,20 +123,14 @@ class Foresight:
     ``solve_s`` is what a plan is charged [s], see :func:`jumplab.studies.chain.run_chain`.
     """
 
-    def __init__(
-        self,
-        course: Course,
-        robot: Robot,
-        planner: Planner,
-        rehearsal: Sequence[JumpPlan],
-        solve_s: float | None = None,
-    ):
-        self.course = course
-        self.robot = robot
-        self._planner = planner
-        self._rehearsal = rehearsal
-        self._solve_s = solve_s
-        self._start = stance_angles(robot)
+    course: Course
+    robot: Robot
+    planner: Planner
+    rehearsal: Sequence[JumpPlan]
+    solve_s: float | None = None
+
+    def __post_init__(self):
+        self._start = stance_angles(self.robot)
         self._missed: dict[int, np.ndarray] = {}  # jump: by how much way and turn (3,) fell short
         # by how much poses (3,) foretold in the air were too far
         self._misjudged: list[np.ndarray] = []
@@ -195,7 +190,7 @@ class Foresight:
             ahead.plan = self._plan(ahead)
         except JumplabError as e:
             ahead.failure = str(e)
-        took = time.perf_counter() - wall if self._solve_s is None else self._solve_s
+        took = time.perf_counter() - wall if self.solve_s is None else self.solve_s
         ahead.solve_s = math.ceil(took / STEP_S - 1e-9) * STEP_S
         ahead.cpu_s = time.process_time() - cpu
         return ahead
@@ -206,4 +201,4 @@ class Foresight:
         turn = np.array([0.0, 0.0, task.yaw_rad])  # perhaps more than half a turn
         way, side, yaw = _turned(step - turn) + turn + ahead.bias
         task = replace(task, distance_m=way, side_m=side, yaw_rad=yaw)
-        return self._planner.replan(self._rehearsal[ahead.number], task, start=ahead.start)
+        return self.planner.replan(self.rehearsal[ahead.number], task, start=ahead.start)

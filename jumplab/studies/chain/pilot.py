@@ -4,6 +4,8 @@ and between them the plan of the next jump.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pinocchio as pin
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
@@ -37,31 +39,25 @@ ROWS = 10  # of the tape per inverse kinematics: exact to 1e-6 rad
 PATIENCE_S = 3.0  # who is not still this long after touchdown will not be
 
 
+@dataclass
 class ChainPilot:
     """Torques of a whole chain, as its :class:`Foresight` plans it; ``landing``, ``look_s`` [s] and
     ``revise_s`` [s] are those of :func:`jumplab.studies.chain.run_chain`, ``hardware`` that of each
     jump's :class:`jumplab.control.Controller`.
     """
 
-    def __init__(
-        self,
-        foresight: Foresight,
-        scene: Scene,
-        landing: str,
-        look_s: float,
-        revise_s: float | None,
-        hardware: Hardware = Hardware(),
-    ):
-        self._foresight = foresight
-        self._course = foresight.course
-        self._robot = foresight.robot
-        self._scene = scene
-        self._landing = landing
-        self._look_s = look_s
-        self._revise_s = revise_s
-        self._hardware = hardware
+    foresight: Foresight
+    scene: Scene
+    landing: str
+    look_s: float
+    revise_s: float | None
+    hardware: Hardware = Hardware()
+
+    def __post_init__(self):
+        self._course = self.foresight.course
+        self._robot = self.foresight.robot
         self._gauge = Gauge(self._robot)
-        self._stand = LandingController(self._robot, force_noise_n=hardware.force_noise_n)
+        self._stand = LandingController(self._robot, force_noise_n=self.hardware.force_noise_n)
         self._tau = np.zeros(len(self._robot.joint_names))
         arms = np.isin(self._robot.joint_names, self._robot.joints["shoulder_pitch"])
         self._still_rad = np.where(arms, STILL_ARM_RAD, STILL_LEG_RAD)
@@ -121,9 +117,9 @@ class ChainPilot:
         seen = self._sight(step, q, v, plans)
         if seen is not None:
             last = self.jumps[-1] if self.jumps else None
-            self.plans.append(self._foresight.look(number, step * STEP_S, *seen, last))
+            self.plans.append(self.foresight.look(number, step * STEP_S, *seen, last))
         elif plans and since >= 0:
-            revisable = plans[-1].air and self._revise_s is not None
+            revisable = plans[-1].air and self.revise_s is not None
             if all(p.failure for p in plans) and not revisable:
                 self.reason = f"no plan for jump {number + 1}: {plans[-1].failure}"
             elif since > PATIENCE_S + sum(p.solve_s for p in plans):
@@ -158,21 +154,21 @@ class ChainPilot:
         if not self.jumps:
             if plans or step * STEP_S < FIRST_STAND_S:
                 return None
-            self._foresight.learn_posture(q)
+            self.foresight.learn_posture(q)
             return self._pose(q), False
         since = self.since_touchdown(step)
         if plans:  # one core plans: a correction waits until the draft is done
-            due = plans[-1].air and self._revise_s is not None and since >= self._revise_s
+            due = plans[-1].air and self.revise_s is not None and since >= self.revise_s
             return (self._pose(q), False) if due and step * STEP_S >= plans[-1].ready_s else None
-        if since >= max(self._look_s, 0.0):
+        if since >= max(self.look_s, 0.0):
             return self._pose(q), False
         jump = self.jumps[-1]
         airborne = self._now(step) * STEP_S > jump.plan.tape.takeoff_time
-        if since >= 0 or self._look_s >= 0 or not airborne:
+        if since >= 0 or self.look_s >= 0 or not airborne:
             return None
         now = self._gauge.motion(headed(q, jump.controller.looks_rad), v)
         left = jump.controller.forecast.time_left(now)
-        return None if left > -self._look_s else (self._at_touchdown(step, q, v, left), True)
+        return None if left > -self.look_s else (self._at_touchdown(step, q, v, left), True)
 
     def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
         """Pose (3,) at the touchdown to come: the posture of the tape, turned as far as the trunk
@@ -203,7 +199,7 @@ class ChainPilot:
         tape = ahead.plan.tape
         if self.jumps:
             plans = [plan for plan in self.plans if plan.number == ahead.number]
-            self._foresight.learn_place(self.jumps[-1], plans, pose)
+            self.foresight.learn_place(self.jumps[-1], plans, pose)
         end = tape.q[-1]
         heading = float(pose[2]) + self._gauge.heading(end)
         ahead.controller = Controller(
@@ -211,9 +207,9 @@ class ChainPilot:
             self._robot,
             mode=MODE,
             reaim=True,
-            landing=self._landing,
-            ground=self._scene.seen_along(heading, self._robot, end).top_at,
-            hardware=self._hardware,
+            landing=self.landing,
+            ground=self.scene.seen_along(heading, self._robot, end).top_at,
+            hardware=self.hardware,
             start_rad=float(pose[2]),
             at_rest=False,  # its posture and rates are led back here
         )
