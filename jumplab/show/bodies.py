@@ -101,7 +101,6 @@ class Silhouette:
         return pin.centerOfMass(self._model, self._data, q)[self._axes].copy()
 
 
-@checked
 def draw_robot(
     ax: Axes,
     body: Silhouette,
@@ -131,7 +130,6 @@ def draw_robot(
             ax.add_patch(Circle(np.add(places[name], (shift, 0.0)), radius, facecolor=face, **look))
 
 
-@checked
 def strobe(
     ax: Axes,
     body: Silhouette,
@@ -155,7 +153,6 @@ def strobe(
     equal_scales(ax)
 
 
-@checked
 def film_strip(
     ax: Axes,
     body: Silhouette,
@@ -173,7 +170,6 @@ def film_strip(
         ax.text(place, -BELOW_M, f"{t:.2f} s", ha="center", va="top", fontsize=7)
 
 
-@checked
 def draw_five_link(
     ax: Axes,
     model: SagittalModel,
@@ -194,7 +190,6 @@ def draw_five_link(
     return points
 
 
-@checked
 def five_link_points(
     model: SagittalModel, angles: np.ndarray, toe: ArrayLike = (0.0, 0.0)
 ) -> dict[str, np.ndarray]:
@@ -208,7 +203,6 @@ def five_link_points(
     return places | {"toe": toe, "heel": toe + rotated(angles[0], model.heel), "com": com}
 
 
-@checked
 def draw_ground(
     ax: Axes, left: float, right: float, *, edge: float | None = None, height: float = 0.0
 ) -> None:
@@ -221,14 +215,12 @@ def draw_ground(
     ax.plot(x, z, color=GROUND, linewidth=0.8, zorder=1.5)
 
 
-@checked
 def draw_path(ax: Axes, x: np.ndarray, z: np.ndarray, zorder: float = 5.0) -> None:
     """The dotted path (n,) [m] of the CoM."""
     z = shaped(z, (len(x),), "z")
     ax.plot(x, z, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=zorder)
 
 
-@checked
 def draw_com(ax: Axes, place: np.ndarray) -> None:
     """The mark of the CoM at ``place`` (2,) [m]."""
     look = dict(markersize=6, color=VERMILION)
@@ -236,7 +228,6 @@ def draw_com(ax: Axes, place: np.ndarray) -> None:
     ax.plot(*place, marker="+", zorder=7, **look)
 
 
-@checked
 def equal_scales(ax: Axes) -> None:
     """Equal scales on both axes, everything in view."""
     ax.set_aspect("equal", adjustable="box")
@@ -245,7 +236,6 @@ def equal_scales(ax: Axes) -> None:
 
 # the sheet of a robot
 # ----------------------------------------------------------------------------------------------
-@checked
 @themed
 def robot_sheet(robot: Robot) -> Figure:
     """A robot standing, its moving joints with their roles from the front, and its five links."""

@@ -17,9 +17,11 @@ import pinocchio as pin
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import ConvexHull
 
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import RobotError
 from jumplab.io.motion import CONTACT_FORCE_N, Motion
 from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet
 from jumplab.robot.files import LEG, SHIPPED
 from jumplab.robot_import.checkup import examine
 from jumplab.show.style import PHASE_COLORS, tint
@@ -78,18 +80,19 @@ class Trace(NamedTuple):
     feet: np.ndarray  # (N, 2, 4, 4) homogeneous transforms of left and right foot link [m]
     com: np.ndarray  # (N, 3) [m]
 
+    def toes(self, robot: Robot) -> np.ndarray:
+        """How far ahead the toes are (N,), the mean of both [m]."""
+        return (self.feet @ [*robot.foot.tip, 1.0])[..., 0].mean(axis=1)
+
 
 def trace(robot: Robot, states: np.ndarray) -> Trace:
     """Joints, feet and CoM at states (N, nq)."""
-    model = robot.model
-    data = model.createData()
-    frames = [model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames]
+    gauge = Gauge(robot)
     rows = []
     for q in states:
-        com = pin.centerOfMass(model, data, q).copy()
-        joints = [pin.SE3ToXYZQUAT(data.oMi[j]) for j in range(1, model.njoints)]
-        feet = [pin.updateFramePlacement(model, data, frame).homogeneous for frame in frames]
-        rows.append((joints, feet, com))
+        feet = [foot.homogeneous for foot in gauge.places(q)]
+        joints = [pin.SE3ToXYZQUAT(place) for place in list(gauge.data.oMi)[1:]]
+        rows.append((joints, feet, gauge.com(q)))
     return Trace(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
@@ -169,11 +172,7 @@ def _coarser(part: Part, cell_m: float) -> Part:
 
 
 def _kind(robot: Robot, joint: int) -> str:
-    frames = [
-        robot.model.frames[robot.model.getFrameId(name, pin.FrameType.BODY)]
-        for name in robot.foot.frames
-    ]
-    feet = [frame.parentJoint for frame in frames]
+    feet = [foot.joint for foot in on_feet(robot, np.zeros(3))]
     return "trunk" if joint == 1 else "rest" if joint in feet else "limb"
 
 

@@ -10,7 +10,7 @@ from jumplab.control.kinematics import Gauge
 from jumplab.robot.stance import knees
 from jumplab.sim import STEP_S
 from jumplab.sim.checks import LOADED_N, friction_used, ground_of
-from jumplab.sim.result import SimulationResult, motors_spent, stray
+from jumplab.sim.result import SimulationResult, motors_spent
 
 CAUSES = ("slip", "over-rotation", "knee stop", "torque", "tip", "other")
 # [1] of the friction, used for so long: the impact of a sound landing slides less
@@ -51,8 +51,7 @@ def signs(result: SimulationResult) -> tuple[Sign, ...]:
         return ()
     if result.robot is None:
         raise ValueError("the log's robot is not known")
-    lying = np.append(stray(result, result.robot).any(axis=1), True)
-    until = int(np.argmax(lying))
+    until = int(np.argmax([*result.stray.any(axis=1), True]))
     rows = {"slip": _slip(result, until), "torque": _torque(result, until)}
     if (result.phase == "landing").any():
         down = int(np.argmax(result.phase == "landing"))
@@ -75,13 +74,11 @@ def _lasting(flags: np.ndarray, time_s: float) -> int | None:
 
 
 def _slip(result: SimulationResult, until: int) -> int | None:
-    gauge = Gauge(result.robot)
     sliding = result.foot_wrench[:until, :, 2] > LOADED_N
     row, side = np.nonzero(sliding)
     if len(row):
-        feet = np.array([[foot.translation for foot in gauge.places(q)] for q in result.q[:until]])
         force = result.foot_wrench[row, side, :3]
-        used = friction_used(force, feet[row, side], ground_of(result))
+        used = friction_used(force, result.feet[row, side, :3, 3], ground_of(result))
         sliding[row, side] = used >= SLIDING * result.settings["perturbation"]["friction"]
     return _lasting(sliding, SLIP_S)
 

@@ -152,7 +152,7 @@ class Run:
             solves=solves,
             settings=settings,
         )
-        return replace(result, checks=check(result, self.real))
+        return replace(result, checks=check(result))
 
 
 @dataclass(frozen=True)
