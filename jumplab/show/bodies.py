@@ -23,7 +23,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.sagittal import rotated
 from jumplab.robot.stance import stance_angles, stance_configuration
-from jumplab.show.shapes import rounded_body
+from jumplab.show.shapes import placed, rounded_body
 from jumplab.show.style import (
     FLIGHT,
     GROUND,
@@ -85,8 +85,7 @@ class Silhouette:
         pin.forwardKinematics(self._model, self._data, q)
         outlines = []
         for part, kind in self._parts:
-            place = self._data.oMi[part.joint]
-            flat = (part.points @ place.rotation.T + place.translation)[:, self._axes]
+            flat = placed(part.points, self._data.oMi[part.joint])[:, self._axes]
             outlines.append((kind, flat[ConvexHull(flat).vertices]))
         return outlines
 
@@ -121,13 +120,13 @@ def draw_robot(
     look = dict(edgecolor=edge, linewidth=0.5, zorder=zorder)
     for kind, outline in body.outlines(q):
         face = tint(color, strength * SHADES[kind])
-        ax.add_patch(Polygon(np.add(outline, (shift, 0.0)), closed=True, facecolor=face, **look))
+        ax.add_patch(Polygon(outline + [shift, 0.0], facecolor=face, **look))
     places = body.joints(q)
+    face = tint(color, 0.9 * strength)
     for role, pair in body.robot.joints.items():
         radius = 0.042 if role in ("hip_pitch", "knee") else 0.032
         for name in pair[:1] if body.view == "side" else pair:
-            face = tint(color, 0.9 * strength)
-            ax.add_patch(Circle(np.add(places[name], (shift, 0.0)), radius, facecolor=face, **look))
+            ax.add_patch(Circle(places[name] + [shift, 0.0], radius, facecolor=face, **look))
 
 
 def strobe(
@@ -163,8 +162,9 @@ def film_strip(
 ) -> None:
     """Frames (n, nq), CoM at ``places`` (n,) [m], times (n,) [s] below the ground."""
     frames = shaped(frames, (None, body.robot.model.nq), "frames")
-    times = shaped(times, (len(frames),), "times")
-    places = shaped(places, (len(frames),), "places")
+    times, places = (
+        shaped(x, (len(frames),), name) for x, name in ((times, "times"), (places, "places"))
+    )
     strobe(ax, body, frames, colors, shifts=places - [body.com(q)[0] for q in frames])
     for place, t in zip(places, times, strict=True):
         ax.text(place, -BELOW_M, f"{t:.2f} s", ha="center", va="top", fontsize=7)

@@ -195,7 +195,8 @@ def write_movie(
 def _encode(pictures: Sequence[Image.Image], kind: str) -> bytes:
     if kind == "mp4":
         coding = dict(codec="libx264", pixelformat="yuv420p", macro_block_size=2, fps=RATES[kind])
-        return images.imwrite("<bytes>", np.stack(pictures), extension=".mp4", plugin="FFMPEG", **coding)
+        where = dict(extension=".mp4", plugin="FFMPEG")
+        return images.imwrite("<bytes>", np.stack(pictures), **where, **coding)
     some = np.vstack(pictures[:: max(1, len(pictures) // 6)])
     palette = Image.fromarray(some).quantize(COLORS)
     plain = dict(palette=palette, dither=Image.Dither.NONE)

@@ -72,6 +72,11 @@ def parts_of(robot: Robot) -> tuple[list[Part], list[str]]:
     return meshes or rounded_body(robot), notes
 
 
+def placed(points: np.ndarray, place: pin.SE3) -> np.ndarray:
+    """Points (n, 3) of a frame as they are seen from where its ``place`` is [m]."""
+    return points @ place.rotation.T + place.translation
+
+
 class Trace(NamedTuple):
     """Where a robot is at N states."""
 
@@ -149,8 +154,7 @@ def _published(robot: Robot) -> tuple[list[Part], list[str]]:
         place = jumper.lumped.place(link)
         joint = robot.model.frames[robot.model.getFrameId(body, pin.FrameType.BODY)].parentJoint
         for points, triangles in jumper.tree.meshes(link):
-            moved = points @ place.rotation.T + place.translation
-            parts.append(Part(joint, _kind(robot, joint), moved, triangles, True))
+            parts.append(Part(joint, _kind(robot, joint), placed(points, place), triangles, True))
     if not parts:
         return [], ["drawn from boxes: its meshes are missing"]
     cell = CELL_M
@@ -180,21 +184,24 @@ def _kind(robot: Robot, joint: int) -> str:
 # ----------------------------------------------------------------------------------------------
 class _Box(NamedTuple):
     joint: int
-    middle: np.ndarray  # (3,) in the joint's frame [m]
-    turn: np.ndarray  # (3, 3)
+    place: pin.SE3  # of its middle, in the joint's frame [m]
     half: np.ndarray  # (3,) [m]
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(3,) in the joint's frame [m]."""
+        return self.place.translation
 
     def rounded(self, share: float) -> np.ndarray:
         """Points (n, 3) of the box, the radius of its edges a ``share`` of the least width."""
         radius = share * 2 * self.half.min()
         inner = zip(radius - self.half, self.half - radius, strict=True)
         corners = np.array(list(itertools.product(*inner)))
-        points = (corners[:, None] + radius * BALL).reshape(-1, 3)
-        return points @ self.turn.T + self.middle
+        return placed((corners[:, None] + radius * BALL).reshape(-1, 3), self.place)
 
     def inside(self, share: np.ndarray) -> np.ndarray:
         """Points (n, 3) given in half sizes of the box."""
-        return (share * self.half) @ self.turn.T + self.middle
+        return placed(share * self.half, self.place)
 
 
 def _boxes(robot: Robot) -> list[_Box]:
@@ -214,9 +221,8 @@ def _boxes(robot: Robot) -> list[_Box]:
     for shape in geometry.geometryObjects:
         shape.geometry.computeLocalAABB()
         box = shape.geometry.aabb_local
-        place = shape.placement
-        middle = place.act((box.max_ + box.min_) / 2)
-        boxes.append(_Box(shape.parentJoint, middle, place.rotation, (box.max_ - box.min_) / 2))
+        place = shape.placement * pin.SE3(np.eye(3), (box.max_ + box.min_) / 2)
+        boxes.append(_Box(shape.parentJoint, place, (box.max_ - box.min_) / 2))
     return boxes
 
 

@@ -138,8 +138,9 @@ class Run:
         if self.ground is not self.scene or not self.ground.plain:
             settings["ground"] = asdict(self.ground)
         if self.pushes:  # what the checks know of them
-            pushes = [replace(push, step=push.step - self._begun) for push in self.pushes]
-            settings["pushes"] = [asdict(push) for push in pushes]
+            settings["pushes"] = [
+                asdict(replace(push, step=push.step - self._begun)) for push in self.pushes
+            ]
             settings["push_place_m"] = self.push_place.tolist()
         higher_m = self.ground.height_of(goal, self.robot, self.scene)
         result = record(
@@ -168,11 +169,10 @@ class Disturbance:
     def apex(self, tape: Tape, robot: Robot) -> tuple[int, np.ndarray, np.ndarray]:
         """Step of the apex of ``tape``, and the disturbed q (nq,), v (nv,) of ``robot`` there."""
         gauge = Gauge(robot)
-        rows = tape.flights[-1]
-        for row in range(rows.start, rows.stop):
-            now = gauge.motion(tape.q[row], tape.v[row])
-            if now.velocity[2] <= 0:
-                break
+        rows = range(len(tape.t))[tape.flights[-1]]
+        sinking = (k for k in rows if gauge.motion(tape.q[k], tape.v[k]).velocity[2] <= 0)
+        row = next(sinking, rows[-1])
+        now = gauge.motion(tape.q[row], tape.v[row])
         v = tape.v[row].copy()
         speed = now.velocity
         seen = about_vertical(gauge.heading(tape.q[-1]) + self.direction_rad)
@@ -242,11 +242,17 @@ def simulate_jump(
         return step >= watched or fallen_s > AFTER_FALL_S
 
     run.play(controller.drive, over, q, v, first)
-    settings = {name: control.get(name, False) for name in ("reaim", "step")}
-    settings |= dict(mode=controller.mode, stand_s=stand_s, **controller.to_json())
-    settings["disturbance"] = disturbance and asdict(disturbance)
-    flights = len(tape.flights) if disturbance is None else 1
-    result = run.result(controller.goal, controller.solves, flights=flights, **settings)
+    result = run.result(
+        controller.goal,
+        controller.solves,
+        flights=len(tape.flights) if disturbance is None else 1,
+        reaim=control.get("reaim", False),
+        step=control.get("step", False),
+        mode=controller.mode,
+        stand_s=stand_s,
+        disturbance=disturbance and asdict(disturbance),
+        **controller.to_json(),
+    )
     return replace(result, metrics=replace(result.metrics, recovery_step_s=controller.stepped_s))
 
 
