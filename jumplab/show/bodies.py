@@ -120,13 +120,13 @@ def draw_robot(
     look = dict(edgecolor=edge, linewidth=0.5, zorder=zorder)
     for kind, outline in body.outlines(q):
         face = tint(color, strength * SHADES[kind])
-        ax.add_patch(Polygon(outline + [shift, 0.0], facecolor=face, **look))
+        ax.add_patch(Polygon(np.add(outline, (shift, 0.0)), facecolor=face, **look))
     places = body.joints(q)
     face = tint(color, 0.9 * strength)
     for role, pair in body.robot.joints.items():
         radius = 0.042 if role in ("hip_pitch", "knee") else 0.032
         for name in pair[:1] if body.view == "side" else pair:
-            ax.add_patch(Circle(places[name] + [shift, 0.0], radius, facecolor=face, **look))
+            ax.add_patch(Circle(np.add(places[name], (shift, 0.0)), radius, facecolor=face, **look))
 
 
 def strobe(
