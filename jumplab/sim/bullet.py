@@ -186,9 +186,6 @@ class BulletEngine(Engine):
                 "align it with its link"
             )
 
-    def _dynamics(self) -> list[tuple]:
-        return [self._bullet.getDynamicsInfo(self._body, i - 1) for i in range(len(self.links))]
-
     def _set_dynamics(self, friction: float) -> None:
         change = partial(self._bullet.changeDynamics, self._body)
         for link in range(-1, len(self.links) - 1):
@@ -223,7 +220,10 @@ class BulletEngine(Engine):
     def kept(self) -> Kept:
         """What the engine has; damping, armature and friction of the motors come in :meth:`step`,
         and the inertia that links are lent is given back there."""
-        rows = dict(zip(self.links, self._dynamics(), strict=True))
+        rows = {
+            link: self._bullet.getDynamicsInfo(self._body, i)
+            for i, link in enumerate(self.links, -1)
+        }
         inertials = {link: inertial(r[0], r[3], r[4], r[2]) for link, r in rows.items()}
         for link, more in self._armature.lent.items():
             inertials[link] -= pin.Inertia(0.0, np.zeros(3), more * np.eye(3))
