@@ -33,7 +33,8 @@ def test_check_finds_draws_and_writes_what_can_be_loaded(capsys, tmp_path, monke
     toml = tmp_path / "out" / "bhr.toml"
     toml.write_text(toml.read_text().replace("knee_rad = 0.5", "knee_rad = 0.6"))
     code, _, err = quoted(capsys, *again)
-    assert (code, err) == (2, f"jumplab: {toml}: has been edited; choose another --out, or overwrite it with --force\n")
+    said = "has been edited, or another version wrote it; choose another --out, or overwrite it with --force"
+    assert (code, err) == (2, f"jumplab: {toml}: {said}\n")
     assert quoted(capsys, *again, "--force")[0] == 0 and "knee_rad = 0.5" in toml.read_text()
 
 

@@ -55,14 +55,14 @@ def run(n: int = 6, substeps: int = 1, **changes) -> SimulationResult:
         "tau": np.zeros((n, MODEL.nv - 6)), "foot_wrench": np.zeros((n, 2, 6)), "com": np.zeros((n, 3)),
         "com_velocity": np.zeros((n, 3)), "L": np.zeros(n), "rho": np.zeros(n), "phase": np.array(["flight"] * n),
         "touching": np.zeros((n, len(LINKS)), bool), "colliding": np.zeros(n, bool), "link_names": LINKS,
-        "joint_names": JOINTS, "metrics": metrics}  # fmt: skip
+        "joint_names": JOINTS, "metrics": metrics, "robot": ROBOT}  # fmt: skip
     settings = {"engine": engine | changes.pop("engine", {}), "perturbation": {"friction": FRICTION}}
     settings |= changes.pop("settings", {})
     return SimulationResult(**(quiet | changes), settings=settings)
 
 
 def said(result: SimulationResult) -> dict:
-    return {f.name: f.value for f in check(result, ROBOT)}
+    return {f.name: f.value for f in check(result)}
 
 
 def random_run(seed: int, substeps: int, n: int = 12) -> SimulationResult:
@@ -139,7 +139,7 @@ def test_what_the_log_does_not_explain(substeps):
 
 
 def explained(result: SimulationResult, substeps: int) -> None:
-    base, joints = unexplained(result, ROBOT)
+    base, joints = unexplained(result)
     assert base.shape == (11, 6) and joints.shape == (11, MODEL.nv - 6)
     for k in range(11):
         need = generalised(result, k, 0.0 if substeps == 1 else 0.5)
@@ -159,10 +159,10 @@ def test_stated_pushes_are_explained(substeps):
     result, arm = random_run(substeps + 7, substeps), np.array([0.1, -0.05, 0.2])
     spans = {(2, 3): (30.0, -20.0, 5.0), (4, 4): (-7.0, 11.0, 0.0), (-2, 3): (0.0, 3.0, 9.0), (-5, 3): (50.0, 0.0, 0.0)}
     told = [{"step": step, "steps": steps, "force_n": list(force)} for (step, steps), force in spans.items()]
-    alone, joints = unexplained(result, ROBOT)
+    alone, joints = unexplained(result)
     for place in (arm, np.zeros(3)):
         how = {"pushes": told} | ({"push_place_m": place.tolist()} if place.any() else {})
-        base, same = unexplained(replace(result, settings=result.settings | how), ROBOT)
+        base, same = unexplained(replace(result, settings=result.settings | how))
         np.testing.assert_array_equal(joints, same)
         for k in range(11):
             force = sum((np.array(f) for (step, n), f in spans.items() if step <= k < step + n), np.zeros(3))
@@ -180,7 +180,7 @@ def test_where_the_log_cannot_say_nothing_is_asked():
     q[7, 7 + 2], q[7, 7 + 3] = motors.lower[2] + 0.0199, motors.upper[3] - 0.0199
     q[8, 7 + 2], q[8, 7 + 3] = motors.lower[2] + 0.0201, motors.upper[3] - 0.0201
     q[9, 7 + 2], q[9, 7 + 3] = motors.lower[2] + STOP_RAD, motors.upper[3] - STOP_RAD
-    base, joints = unexplained(replace(result, touching=touching, colliding=colliding, q=q), ROBOT)
+    base, joints = unexplained(replace(result, touching=touching, colliding=colliding, q=q))
     assert not base[3].any() and not joints[3].any()
     assert not joints[5].any() and base[5].all()
     assert list(np.flatnonzero(joints[7] == 0)) == [2, 3]
@@ -412,6 +412,6 @@ def test_a_claimed_landing_is_timed():
 
 @pytest.mark.parametrize("substeps", [1, 2])
 def test_what_a_run_is_asked(substeps):
-    found = check(run(substeps=substeps), ROBOT)
+    found = check(run(substeps=substeps))
     assert [(f.name, f.limit, f.unit) for f in found] == [(k, x[substeps > 1], x[2]) for k, x in ASKED.items()]
     assert all(f.catches for f in found)

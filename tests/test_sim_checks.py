@@ -7,9 +7,10 @@ from importlib import import_module
 import numpy as np
 import pytest
 from fixtures_core import jump as planned
+from paper.basin import WrongApex
 
 from jumplab.cli.common import print_simulation
-from jumplab.sim import Disturbance, MujocoEngine, Perturbation, simulate_jump
+from jumplab.sim import MujocoEngine, Perturbation, simulate_jump
 from jumplab.sim import loop as jump
 from jumplab.sim.checks import check
 from jumplab.sim.motors import Motors
@@ -66,7 +67,7 @@ def test_on_usual_contacts_mechanics_hold_to_rounding(bhr, tape, engine, mode):
 
 def test_quick_legs_pass(bhr, tape):
     """Re-aim swings the legs as fast as it may: the engine's own error is largest here."""
-    result = simulate_jump(tape, bhr, disturbance=Disturbance(0.8, -0.17, 0.1), mode="pd", reaim=True, stand_s=SHORT_S)
+    result = simulate_jump(tape, bhr, disturbance=WrongApex(0.8, -0.17, 0.1), mode="pd", reaim=True, stand_s=SHORT_S)
     assert failed(result) == set()
 
 
@@ -177,7 +178,7 @@ def test_feet_that_press_beyond_their_sole(bhr, short):
     """The same from the forces alone: wrenches of a robot with longer feet, judged by the stated ones."""
     small = replace(bhr, config_text=bhr.config_text.replace("[-0.10, 0.14]", "[-0.10, 0.13]"))
     assert small.foot.toe == bhr.foot.toe - 0.01
-    names = {finding.name for finding in check(short, small) if not finding.passed}
+    names = {finding.name for finding in check(replace(short, robot=small)) if not finding.passed}
     assert "CoP outside the sole" in names
 
 
@@ -225,6 +226,6 @@ def test_what_the_engine_has_is_read_back(bhr, tape, monkeypatch, engine, cheat,
 def test_a_landing_shorter_than_three_seconds(bhr, short):
     assert not short.landed and short.checks_passed
     claimed = replace(short, metrics=replace(short.metrics, landed=True))
-    found = {finding.name: finding for finding in check(claimed, bhr)}
+    found = {finding.name: finding for finding in check(claimed)}
     lacking = found["claimed landing, short of 3 s by"]
     assert not lacking.passed and lacking.value == pytest.approx(STAND_S - SHORT_S - 0.05, abs=0.002)

@@ -9,6 +9,7 @@ import sys
 import fixtures_core
 import numpy as np
 import pytest
+from paper.basin import WrongApex
 
 from jumplab.control.controller import level
 from jumplab.control.flight import Flight
@@ -20,7 +21,6 @@ from jumplab.robot import Robot
 from jumplab.sim import (
     INSTALLED,
     STEP_S,
-    Disturbance,
     Perturbation,
     Ranges,
     Scene,
@@ -166,14 +166,14 @@ def test_same_seed_same_jump(bhr, tape):
 def test_reaim_leaves_a_good_flight_alone_and_saves_a_bad_one(bhr, tape, look):
     aimed = simulate(tape, bhr, reaim=True, stand_s=SHORT_S).metrics
     assert aimed.foot_distance_touchdown_m == pytest.approx(look.metrics.foot_distance_touchdown_m, abs=0.01)
-    tipped = Disturbance(pitch_rad=-np.radians(10))
+    tipped = WrongApex(pitch_rad=-np.radians(10))
     assert "touched the ground" in simulate(tape, bhr, disturbance=tipped).reason
     saved = simulate(tape, bhr, disturbance=tipped, reaim=True)
     assert saved.landed and saved.settings["disturbance"]["pitch_rad"] < 0
 
 
 def test_disturbance_is_what_it_says(bhr, tape):
-    (step, q, v), (again, p, u) = (x.apex(tape, bhr) for x in (Disturbance(), Disturbance(1.2, 0.1, 0.05)))
+    (step, q, v), (again, p, u) = (x.apex(tape, bhr) for x in (WrongApex(), WrongApex(1.2, 0.1, 0.05)))
     plain, other = Gauge(bhr).motion(q, v), Gauge(bhr).motion(p, u)
     assert again == step and abs(plain.velocity[2]) < 0.02
     assert other.com - plain.com == pytest.approx([0, 0, 0.05])
@@ -245,7 +245,7 @@ def test_a_ditch_swallows_a_short_jump_alone(bhr, tape):
 
 
 def test_a_fall_is_called_a_fall_and_a_short_look_no_landing(bhr, tape, look):
-    run = simulate(tape, bhr, disturbance=Disturbance(pitch_rad=0.6))
+    run = simulate(tape, bhr, disturbance=WrongApex(pitch_rad=0.6))
     assert not run.landed and "touched the ground" in run.reason and run.metrics.standing_s < 3
     assert run.t[-1] < 2.5  # not simulated for longer than it is worth
     assert run.checks_passed

@@ -6,14 +6,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump
-from paper.basin import landing_basin
+from paper.basin import WrongApex, landing_basin
 
 from jumplab.control import STAND_S
 from jumplab.control.kinematics import Gauge, State
 from jumplab.control.launch import ROLLING_S, LaunchFeedback
 from jumplab.control.playback import Playback
 from jumplab.errors import InputError
-from jumplab.sim import INSTALLED, STEP_S, Disturbance, Perturbation, Ranges, SensorNoise, Shove, simulate_jump
+from jumplab.sim import INSTALLED, STEP_S, Perturbation, Ranges, SensorNoise, Shove, simulate_jump
 from jumplab.studies.trials import TrialSettings
 
 NOISY = SensorNoise.typical()
@@ -179,7 +179,7 @@ def test_where_it_has_no_effect_it_is_refused(bhr, tape, tmp_path):
     with pytest.raises(InputError, match=r"^feedback answers to all that is measured"):
         TrialSettings("pd", feedback=True)
     with pytest.raises(InputError, match="feedback acts in launch, and a run from the apex has none; leave one"):
-        simulate_jump(tape, bhr, feedback=True, disturbance=Disturbance(pitch_rad=0.1))
+        simulate_jump(tape, bhr, feedback=True, disturbance=WrongApex(pitch_rad=0.1))
     with pytest.raises(InputError, match="feedback acts in launch, and the basin's states are those of a flight"):
         landing_basin(tmp_path, 1, TrialSettings(MODE, feedback=True))
 

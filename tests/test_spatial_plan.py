@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import slopes
+from paper.basin import WrongApex
 from test_transcription import data_vector, sparse
 
 import jumplab as jl
@@ -27,7 +28,7 @@ from jumplab.ocp.nlp import EXPLAINED
 from jumplab.ocp.posing import pack
 from jumplab.ocp.problem import Point
 from jumplab.robot.stance import configuration, stance_angles
-from jumplab.sim import STEP_S, Disturbance
+from jumplab.sim import STEP_S
 from jumplab.sim.scene import Scene
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Contacts, Limits, Mesh, Place, Weights, WholeBodyPlanner
@@ -224,7 +225,7 @@ def test_playback_lands_in_its_place_and_heading(task, engine, mode):
 @pytest.mark.parametrize("task, tipped_rad", [(SIDE, 0.1), (SIDE, -0.1), (TURN, 0.1), (TURN, -0.1)])
 def test_lands_on_one_foot_before_the_other(task, tipped_rad, engine):
     """Tipped sideways in flight, one sole meets the ground 2 cm before the other; the robot stands all the same."""
-    result = jl.simulate(jump(task), engine=engine, disturbance=Disturbance(1.0, tipped_rad, direction_rad=np.pi / 2))
+    result = jl.simulate(jump(task), engine=engine, disturbance=WrongApex(1.0, tipped_rad, direction_rad=np.pi / 2))
     loaded = (result.foot_wrench[:, :, 2] > 30.0) & (result.phase == "landing")[:, None]
     left, right = (result.t[np.argmax(foot)] for foot in loaded.T)
     assert 0.004 < (right - left) * np.sign(tipped_rad) < 0.03, (left, right)
@@ -526,8 +527,8 @@ def test_platforms_lie_along_the_travel(task):
 def test_a_wrong_apex_has_a_direction(bhr):
     """Tipped to the left, faster along the way: the velocity of the CoM and its place are otherwise the same."""
     tape, gauge = jump(TURN).tape, Gauge(bhr)
-    _, q, v = Disturbance().apex(tape, bhr)
-    _, tipped, faster = Disturbance(1.2, 0.1, direction_rad=np.pi / 2).apex(tape, bhr)
+    _, q, v = WrongApex().apex(tape, bhr)
+    _, tipped, faster = WrongApex(1.2, 0.1, direction_rad=np.pi / 2).apex(tape, bhr)
     assert gauge.com(tipped) == pytest.approx(gauge.com(q), abs=1e-9)
     speed = gauge.motion(q, v).velocity
     assert gauge.motion(tipped, faster).velocity == pytest.approx(speed * [1.2, 1.2, 1.0], abs=1e-9)

@@ -136,7 +136,8 @@ def _write(folder: Path, text: str, force: bool) -> Path:
     content = text.encode()
     if path.exists() and not force and path.read_bytes() != content:
         raise InputError(
-            f"{path}: has been edited, or another version wrote it; choose another --out, or overwrite it with --force"
+            f"{path}: has been edited, or another version wrote it; choose another --out, or "
+            f"overwrite it with --force"
         )
     try:
         io.folder.write_file(path, content)

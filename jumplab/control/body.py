@@ -44,7 +44,6 @@ class WholeBody:
     """
 
     def __init__(self, robot: Robot):
-        self._robot = robot
         self._model = robot.model
         self._data = self._model.createData()
         self._middles = on_feet(robot, robot.foot.center)
@@ -87,7 +86,7 @@ class WholeBody:
         """Let only the feet flagged in ``contact`` (2,) transmit wrenches."""
         for side in (0, 1):
             at = self.nv + 6 * side
-            unit = self._unit * float(contact[side])
+            unit = self._unit * contact[side]
             self._dynamics[:, at : at + 6] = -unit * self.sole_rows[side, :, : self.nv].T
             self.force_rows[AXES, at + AXES] = unit / self.mass
             self.momentum_rows[:, at : at + 3] = unit * pin.skew(self.soles[side] - self.com)

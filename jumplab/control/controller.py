@@ -112,7 +112,7 @@ class Controller:
         start_rad: float = 0.0,
         at_rest: bool = True,
     ):
-        if not isinstance(landing, str) or landing not in LANDINGS:
+        if landing not in LANDINGS:
             raise InputError(f"landing {quoted(landing)}: must be one of {', '.join(LANDINGS)}")
         self.goal = tape.q[-1]
         tape = tape.until(tape.caught)
@@ -122,14 +122,12 @@ class Controller:
         self.looks_rad = start_rad + heading
         tape = replace(tape, q=headed(tape.q, heading), f=turned_wrench(tape.f, heading))
         self._last = tape.q[-1]
-        self._none = np.zeros(len(robot.joint_names))
-        self._tau = self._none
+        self._tau = np.zeros(len(robot.joint_names))
         self._at_rest = at_rest
         self.touchdown: int | None = None
         self.mode = mode
         self.playback = Playback(tape, robot, hardware.delay_s)
-        kind = servo_of(mode)
-        self._servo = kind(robot, hardware.delay_s, hardware.substeps)
+        self._servo = servo_of(mode)(robot, hardware.delay_s, hardware.substeps)
         if feedback:
             check_mode(mode)
         if feedback is None:
@@ -179,6 +177,8 @@ class Controller:
         ``state``; to be called once in each :data:`~jumplab.control.STEP_S`.
         """
         command = self.command(round(t / STEP_S), state.along(self.looks_rad))
+        if command.q is None:
+            return Drive(command.tau)
         return self._servo.drive(command, *(command.state or state[:2]))
 
     def command(self, step: int, state: State) -> Command:
@@ -200,7 +200,7 @@ class Controller:
 
     def _play(self, step: int, state: State) -> Command:
         """Before the last flight is under way."""
-        command = self.playback.command(step, *state[:2], self._none)
+        command = self.playback.command(step, *state[:2])
         return command if self.feedback is None else self.feedback(step, command, state)
 
     def _touches(self, step: int, state: State) -> bool:
@@ -213,9 +213,9 @@ class Controller:
         now = self._gauge.motion(q, v)
         left = self.forecast.time_left(now)
         shift = self.forecast.shift(step, now, left) if self._shifts else (0.0, 0.0)
-        if left <= LEAD_S:
+        if left <= LEAD_S and self.ahead.followed is None:
             self._look_ahead(step, now, left)
-        aimed = self._none
+        aimed = 0.0
         if self._reaim is not None:
             turn = self.forecast.turn_ahead(step, now, left)
             aimed = self._reaim.correction(now, turn, left)
@@ -235,9 +235,7 @@ class Controller:
         return Command(tau=self._tau)
 
     def _look_ahead(self, step: int, now: Motion, left: float) -> None:
-        """Plan the landing for the touchdown in ``left`` seconds, unless that is done."""
-        if self.ahead.source != "planned" or self.ahead.followed is not None:
-            return
+        """Plan the landing for the touchdown in ``left`` seconds."""
         turn = self.forecast.turn_ahead(step, now, left)
         correction = 0.0
         if self._reaim is not None:
@@ -255,7 +253,7 @@ class Controller:
         yaw = round(yaw_of(turn), HEADING_DIGITS)
         self.looks_rad += yaw
         state = state.along(yaw)
-        if self.ahead.source == "planned" and self.ahead.followed is None:  # ground came early
+        if self.ahead.followed is None:  # ground came early
             self.landing.reference = self.ahead.plan(*state[:2], step * STEP_S, 0.0)
         return state
 

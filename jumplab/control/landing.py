@@ -8,7 +8,7 @@ CoM, angular momentum, trunk, feet flat and still, posture.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -18,7 +18,6 @@ from jumplab.control.kinematics import Gauge
 from jumplab.control.step import RecoveryStep
 from jumplab.ocp.qp import Qp
 from jumplab.robot import Robot
-from jumplab.robot.legs import Size
 from jumplab.robot.stance import stance_configuration
 from jumplab.stages.srmp.landing import LandingPlan
 
@@ -61,9 +60,10 @@ class LandingGains:
     com_weight: tuple[float, float, float] = (30.0, 10.0, 30.0)
     momentum_weight: float = 0.5  # of L-rate over a nominal inertia, hence also rad/s^2
     trunk_weight: float = 0.5
-    foot_weight: tuple[float, float] = (20.0, 0.5)  # displacement, turning
-    swing_weight: tuple[float, float] = (1.0, 0.05)
-    step_weight: tuple[float, float] = (20.0, 0.5)  # of a foot in a recovery step
+    foot_weight: float = 20.0  # of a foot that stands, or takes a recovery step
+    foot_turning_weight: float = 0.5
+    swing_weight: float = 1.0  # of one that is to come down
+    swing_turning_weight: float = 0.05
     arm_posture_weight: float = 0.02
     leg_posture_weight: float = 0.002  # pitch joints; feet, CoM and trunk decide them already
     lateral_posture_weight: float = 0.2  # yaw and roll joints
@@ -72,28 +72,13 @@ class LandingGains:
     wrench_weight: float = 1e-3  # [1 / (100 N)^2]
     acceleration_weight: float = 1e-4
 
-    def of(self, size: Size) -> LandingGains:
-        """Those of a robot of another ``size``, whose landing they make alike."""
-        turning = size.of(1.0, "s") ** 4
-        pairs = {
-            name: (moving, turning * weight)
-            for name in FOOT_WEIGHTS
-            for moving, weight in [getattr(self, name)]
-        }
-        rates = {name: size.of(getattr(self, name), "rad/s") for name in RATES}
-        others = {name: turning * getattr(self, name) for name in TURNING_WEIGHTS}
-        return replace(self, **rates, **others, **pairs)
 
-
-# fields of the gains by their unit: natural frequencies, weights of a foot's motion and turning,
-# weights of angular accelerations
-RATES = [name for name in vars(LandingGains()) if "_rate" in name]
-FOOT_WEIGHTS = "foot_weight", "swing_weight", "step_weight"
-TURNING_WEIGHTS = [
-    *("momentum_weight", "trunk_weight", "arm_posture_weight", "leg_posture_weight"),
-    *("lateral_posture_weight", "stop_weight"),
-]
 GAINS = LandingGains()  # of a robot of size one
+# their units, where a robot's size matters: natural frequencies, weights of angular accelerations
+TURNING = "momentum trunk foot_turning swing_turning arm_posture leg_posture lateral_posture stop"
+UNITS = {f"{name}_rate": "rad/s" for name in ("momentum", "trunk", "foot", "posture")}
+UNITS |= {"com_rate_xy": "rad/s", "com_rate_z": "rad/s"}
+UNITS |= {f"{name}_weight": "(rad/s^2)^-2" for name in TURNING.split()}
 
 
 class LandingController:
@@ -116,7 +101,7 @@ class LandingController:
     ):
         self._may_step = may_step
         self.body = body = WholeBody(robot)
-        self.gains = GAINS.of(body.size)
+        self.gains = body.size.scaled(GAINS, UNITS)
         self._horizon_s = body.size.of(STOP_HORIZON_S, "s")
         self._leave = body.size.of(STOP_LEAVE, "rad/s^2")
         self._most_turn = body.size.of(MAX_TURN, "rad/s^2")
@@ -125,23 +110,20 @@ class LandingController:
         self.step = RecoveryStep(robot, SOLE_SHARE, force_noise_n)
         self.solver = solver()
         self._loaded_n = max(body.size.of(CONTACT_FORCE_N, "N"), LIKELY * force_noise_n)
-        weights = {
-            name: self.gains.leg_posture_weight for pair in robot.joints.values() for name in pair
-        }
-        weights |= dict.fromkeys(robot.joints["shoulder_pitch"], self.gains.arm_posture_weight)
-        side = self.gains.lateral_posture_weight
-        self._posture_weight = np.array([weights.get(name, side) for name in robot.joint_names])
+        g = self.gains
+        pitching = np.isin(robot.joint_names, [name for name, _, _ in robot.role_signs()])
+        arms = np.isin(robot.joint_names, robot.joints["shoulder_pitch"])
+        legs_weight = np.where(pitching, g.leg_posture_weight, g.lateral_posture_weight)
+        self._posture_weight = np.where(arms, g.arm_posture_weight, legs_weight)
         self._corners = corner_rows(robot, PLANNED_FRICTION, *SOLE_SHARE)
         self._last_contact = np.full(2, -np.inf)
         # accelerations, wrenches, and what these differ by
-        nv = body.nv
-        wrenches = body.unknowns[nv:]
-        self._effort_rows = np.vstack([body.unknowns, wrenches[:6] - wrenches[6:]])
-        g = self.gains
+        left, right = body.unknowns[-12:-6], body.unknowns[-6:]
+        self._effort_rows = np.vstack([body.unknowns, left - right])
         weights = (g.acceleration_weight, g.wrench_weight, g.uneven_weight)
-        self._effort_weight = np.repeat(weights, [nv, 12, 6])
+        self._effort_weight = np.repeat(weights, [body.nv, 12, 6])
         rest = stance_configuration(robot)
-        self._rest = rest[7:].copy()
+        self._rest = rest[7:]
         self._rest_pitch = float(robot.stance["trunk_pitch_rad"])
         self._height = float(Gauge(robot).com(rest)[2])  # above the soles
         self.reference = reference
@@ -195,13 +177,14 @@ class LandingController:
         qp.cost("trunk", body.unknowns[3:6], self._trunk_wish(v), g.trunk_weight)
         for side in (0, 1):
             wish = self._foot_wish(side, contact[side], ground[:, 2].min())
-            weight = g.foot_weight if contact[side] else g.swing_weight
+            weight = g.foot_weight, g.foot_turning_weight
             if side == self.step.side:
                 wish[:3] = np.clip(self.step.foot_acceleration(time, body), -MAX_STEP, MAX_STEP)
-                weight = g.step_weight
+            elif not contact[side]:
+                weight = g.swing_weight, g.swing_turning_weight
             target = wish - body.sole_drift[side]
             qp.cost(f"foot {side}", body.sole_rows[side], target, np.repeat(weight, 3))
-        qp.cost("posture", body.unknowns[6 : body.nv], *self.posture_wish(q, v))
+        qp.cost("posture", body.unknowns[6:-12], *self.posture_wish(q, v))
         qp.cost("effort", self._effort_rows, 0.0, self._effort_weight)
         return qp
 
@@ -256,8 +239,6 @@ class LandingController:
         for stop, way in ((motors.lower, 1.0), (motors.upper, -1.0)):
             needed = 2 * (way * (stop - ahead) + STOP_MARGIN_RAD) / self._horizon_s**2
             near = needed > 0
-            if not near.any():
-                continue
             # or a joint that is to go back would rest just there
             away = np.clip(way * wish, 0.0, self._leave)
             wish[near] = way * np.clip(np.maximum(needed, away), 0.0, self._most_turn)[near]

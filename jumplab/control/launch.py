@@ -120,8 +120,7 @@ class LaunchFeedback:
         self._air_s = next(iter(air_s), np.inf)  # of the first flight
         # of the joints, off the tape
         self.angles, self._rates, self.changes = np.zeros((3, len(robot.joint_names)))
-        self._none = np.zeros(len(robot.joint_names))
-        self._torque = self._none  # besides the tape's
+        self._torque: np.ndarray | float = 0.0  # besides the tape's
         self._farthest = 0.0  # [rad]
         # mass on the trunk [kg], and that times its place ahead of and above the base [kg m]
         self._load = np.zeros(3)
@@ -180,11 +179,11 @@ class LaunchFeedback:
         way = pin.difference(model, self._first, q)
         moved = pin.computeCentroidalMap(model, self._gauge.data, self._first) @ way
         com = moved[:3] / self._robot.total_mass
-        turned = moved[3:]
-        left, rate, acceleration = self.playback.way_back()
-        ways = (left, com), (rate, com), (acceleration, com), (rate, turned), (acceleration, turned)
-        for column, (share, off) in enumerate(ways):
-            self.rows[: len(share), column] += share[:, None] * off
+        left, *rates = self.playback.way_back()
+        # of the CoM and its rates, then of L and its rate
+        offs = np.array([com, com, com, moved[3:], moved[3:]])
+        shares = np.stack([left, *rates, *rates], axis=1)
+        self.rows[: len(left), :5] += shares[:, :, None] * offs
 
     def __call__(self, step: int, command: Command, state: State) -> Command:
         """``command`` of the tape at ``step``, changed; from the measured state, in the tape's
@@ -194,7 +193,7 @@ class LaunchFeedback:
         stand = self.playback.stands(due)
         if stand == AIR or due >= len(self.rows):
             self.changes = self._back(self._fade_rate)
-            self._torque = self._none
+            self._torque = 0.0
         elif step % PERIOD_STEPS == 0:
             ahead = step + self._rolling
             # an impact says nothing of loads
@@ -204,13 +203,17 @@ class LaunchFeedback:
                 self.changes = -2 * self._posture_rate * self._rates
             else:
                 self.changes, tau = self._solve(due, stand, *(command.state or state[:2]))
-                self._torque = self._none if tau is None else tau - command.tau
+                self._torque = 0.0 if tau is None else tau - command.tau
         self._rates = self._rates + STEP_S * self.changes
         self.angles = self.angles + STEP_S * self._rates
         self._farthest = max(self._farthest, float(np.abs(self.angles).max()))
-        moves = dict(q=command.q + self.angles, rate=command.rate + self._rates)
-        moves |= dict(acceleration=command.acceleration + self.changes)
-        return replace(command, **moves, tau=command.tau + self._torque)
+        return replace(
+            command,
+            q=command.q + self.angles,
+            rate=command.rate + self._rates,
+            acceleration=command.acceleration + self.changes,
+            tau=command.tau + self._torque,
+        )
 
     def _feel(self, state: State, planned: np.ndarray) -> None:
         """Learn from the feet's wrenches where the CoM is, unless they carry little or are tilted.

@@ -56,7 +56,7 @@ class Playback:
     """
 
     def __init__(self, tape: Tape, robot: Robot, lead_s: float = 0.0):
-        names = tuple(str(n) for n in tape.joint_names)
+        names = tuple(map(str, tape.joint_names))
         if names != robot.joint_names:
             raise InputError(
                 f"the tape's joints {', '.join(names[:3])} ... are not those of robot {robot.name}"
@@ -77,8 +77,9 @@ class Playback:
         self.lands = int(np.argmax([*(changes > 0).any(axis=1), True])) + 1
         self._change = np.diff(self.tau, axis=0, append=self.tau[-1:])
         self._change[:-1][changes.any(axis=1)] = 0.0  # what the ground gives changes there at once
-        first = (self._stands != self._stands[0]).any(axis=1)
-        self._moves = int(np.argmax(first)) if first.any() else self.steps
+        moved = (self._stands != self._stands[0]).any(axis=1)
+        # the first step in which a foot stands otherwise
+        self._moves = int(np.argmax([*moved[:-1], True]))
 
     def stands(self, step: float) -> Stand:
         """How the feet stand by the plan."""
@@ -90,7 +91,7 @@ class Playback:
         step: int,
         q: np.ndarray,
         v: np.ndarray,
-        correction: np.ndarray,
+        correction: np.ndarray | float = 0.0,
         shift_s: float = 0.0,
         pace: float = 0.0,
     ) -> Command:
@@ -106,10 +107,16 @@ class Playback:
         rate = between(self._rate, at)
         acceleration = (1 + pace) ** 2 * (between(self._rate, at + 1.0) - rate) / STEP_S
         rate = (1 + pace) * rate if at < self.steps else np.zeros(len(rate))
-        moves = dict(q=angles, rate=rate, acceleration=acceleration)
-        moves |= dict(tau=between(self.tau, at), change=between(self._change, at))
-        moves |= dict(wrench=between(self._wrench, at))
-        return Command(**moves, feet=self.stands(at), state=(q, v))
+        return Command(
+            q=angles,
+            rate=rate,
+            acceleration=acceleration,
+            tau=between(self.tau, at),
+            change=between(self._change, at),
+            feet=self.stands(at),
+            wrench=between(self._wrench, at),
+            state=(q, v),
+        )
 
     def approach(self, q: np.ndarray) -> None:
         """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the

@@ -55,7 +55,7 @@ class LandingAhead:
     def __init__(self, robot: Robot, source: str, again: bool = False):
         self._robot = robot
         self.source = source
-        self.followed: str | None = None
+        self.followed = None if source == "planned" else source
         self._planned: dict[str, float | None] = {}
         self._reason: str | None = None
         self._size = size(robot)
@@ -63,7 +63,7 @@ class LandingAhead:
         self._next: LandingPlan | None = None
         # plans made after the touchdown, states from which stage 1 found none, the longest solve
         self.again = dict(made=0, refused=0, slowest_s=0.0) if again else None
-        if source == "planned":
+        if self.followed is None:
             try:  # now, so that the solve in flight is all that is left to do
                 landing_planner(robot)
             except JumplabError as e:  # a robot for which stage 1 has no landing

@@ -75,7 +75,7 @@ class Drive:
     something newer arrives.
     """
 
-    tau: np.ndarray  # (n,) [N m]
+    tau: np.ndarray | float  # (n,) [N m]
     q: np.ndarray | float = 0.0  # (n,) [rad]
     rate: np.ndarray | float = 0.0  # (n,) [rad/s]
     kp: np.ndarray | float = 0.0  # (n,) [N m/rad]
@@ -111,14 +111,11 @@ class PositionServo:
         inertia = 1 / np.diag(np.linalg.inv(mass))[6:]
         self.kp = np.minimum(STIFFNESS * motors.effort, MOST_KP * inertia / STEP_S**2)
         self.kd = np.minimum(STIFFNESS_TIME_S * self.kp, MOST_KD * inertia / STEP_S)
-        self._none = np.zeros(len(motors.effort))
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
         """What is sent for ``command``; the measured (q, v) are not used."""
-        if command.q is None:
-            return Drive(command.tau)
         ahead = command.q + (command.tau + self._late * command.change) / self.kp
-        return Drive(self._none, ahead, command.rate, self.kp, self.kd)
+        return Drive(0.0, ahead, command.rate, self.kp, self.kd)
 
 
 class TorqueServo:
@@ -147,8 +144,6 @@ class TorqueServo:
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
         """What is sent for ``command`` at the measured (q, v)."""
-        if command.q is None:
-            return Drive(command.tau)
         tau = command.tau + self._late * command.change
         error = command.q - q[7:]
         rate_error = command.rate - v[6:]
@@ -179,7 +174,6 @@ class WholeBodyServo:
     def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
         self._step_s = STEP_S + late_s
         self._ahead_s = STEP_S / substeps / 2
-        self._robot = robot
         self._model = robot.model
         self._data = self._model.createData()
         self._motors = robot.limits
@@ -195,11 +189,7 @@ class WholeBodyServo:
         return Drive(self.torque(command, q, v))
 
     def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Torques (nv - 6,) for ``command`` at the measured (q, v) [N m]; those of the command, if
-        it has any.
-        """
-        if command.q is None:
-            return command.tau
+        """Torques (nv - 6,) for ``command`` at the measured (q, v) [N m]."""
         pin.computeAllTerms(self._model, self._data, q, v)
         pin.forwardKinematics(self._model, self._data, q, v, np.zeros(len(v)))
         feet, drift, units, shared = self._feet(command)
@@ -208,8 +198,8 @@ class WholeBodyServo:
         error = command.q + self._ahead_s * command.rate - q[7:]
         wish = command.rate + self._step_s * command.acceleration + CORNER * error
         tau = tau + self._damping * (wish - self._rates_after(tau, carried, wish, v, push))
-        if self._robot.limits.lossy:  # at the due rate: a measured one would swing with its noise
-            tau = tau + self._robot.limits.lost(command.rate)
+        # at the due rate: a measured one would swing with its noise
+        tau = tau + self._motors.lost(command.rate)
         # a joint that was thrown beyond its no-load speed can still be braked
         low, high = self._motors.range(v[6:])
         return np.clip(tau, command.share * low, command.share * high)
@@ -296,6 +286,6 @@ SERVOS = {"position": PositionServo, "pd": TorqueServo, "whole-body": WholeBodyS
 
 def servo_of(mode: str) -> type[PositionServo | TorqueServo | WholeBodyServo]:
     """The servo of a ``mode``; raises :class:`InputError` if there is none."""
-    if not isinstance(mode, str) or mode not in SERVOS:
+    if mode not in SERVOS:
         raise InputError(f"mode {quoted(mode)}: must be one of {', '.join(SERVOS)}")
     return SERVOS[mode]

@@ -23,7 +23,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.sagittal import rotated
 from jumplab.robot.stance import stance_angles, stance_configuration
-from jumplab.show.shapes import rounded_body
+from jumplab.show.shapes import placed, rounded_body
 from jumplab.show.style import (
     FLIGHT,
     GROUND,
@@ -85,8 +85,7 @@ class Silhouette:
         pin.forwardKinematics(self._model, self._data, q)
         outlines = []
         for part, kind in self._parts:
-            place = self._data.oMi[part.joint]
-            flat = (part.points @ place.rotation.T + place.translation)[:, self._axes]
+            flat = placed(part.points, self._data.oMi[part.joint])[:, self._axes]
             outlines.append((kind, flat[ConvexHull(flat).vertices]))
         return outlines
 
@@ -101,7 +100,6 @@ class Silhouette:
         return pin.centerOfMass(self._model, self._data, q)[self._axes].copy()
 
 
-@checked
 def draw_robot(
     ax: Axes,
     body: Silhouette,
@@ -122,16 +120,15 @@ def draw_robot(
     look = dict(edgecolor=edge, linewidth=0.5, zorder=zorder)
     for kind, outline in body.outlines(q):
         face = tint(color, strength * SHADES[kind])
-        ax.add_patch(Polygon(np.add(outline, (shift, 0.0)), closed=True, facecolor=face, **look))
+        ax.add_patch(Polygon(np.add(outline, (shift, 0.0)), facecolor=face, **look))
     places = body.joints(q)
+    face = tint(color, 0.9 * strength)
     for role, pair in body.robot.joints.items():
         radius = 0.042 if role in ("hip_pitch", "knee") else 0.032
         for name in pair[:1] if body.view == "side" else pair:
-            face = tint(color, 0.9 * strength)
             ax.add_patch(Circle(np.add(places[name], (shift, 0.0)), radius, facecolor=face, **look))
 
 
-@checked
 def strobe(
     ax: Axes,
     body: Silhouette,
@@ -155,7 +152,6 @@ def strobe(
     equal_scales(ax)
 
 
-@checked
 def film_strip(
     ax: Axes,
     body: Silhouette,
@@ -166,14 +162,14 @@ def film_strip(
 ) -> None:
     """Frames (n, nq), CoM at ``places`` (n,) [m], times (n,) [s] below the ground."""
     frames = shaped(frames, (None, body.robot.model.nq), "frames")
-    times = shaped(times, (len(frames),), "times")
-    places = shaped(places, (len(frames),), "places")
+    times, places = (
+        shaped(x, (len(frames),), name) for x, name in ((times, "times"), (places, "places"))
+    )
     strobe(ax, body, frames, colors, shifts=places - [body.com(q)[0] for q in frames])
     for place, t in zip(places, times, strict=True):
         ax.text(place, -BELOW_M, f"{t:.2f} s", ha="center", va="top", fontsize=7)
 
 
-@checked
 def draw_five_link(
     ax: Axes,
     model: SagittalModel,
@@ -194,7 +190,6 @@ def draw_five_link(
     return points
 
 
-@checked
 def five_link_points(
     model: SagittalModel, angles: np.ndarray, toe: ArrayLike = (0.0, 0.0)
 ) -> dict[str, np.ndarray]:
@@ -208,7 +203,6 @@ def five_link_points(
     return places | {"toe": toe, "heel": toe + rotated(angles[0], model.heel), "com": com}
 
 
-@checked
 def draw_ground(
     ax: Axes, left: float, right: float, *, edge: float | None = None, height: float = 0.0
 ) -> None:
@@ -221,14 +215,12 @@ def draw_ground(
     ax.plot(x, z, color=GROUND, linewidth=0.8, zorder=1.5)
 
 
-@checked
 def draw_path(ax: Axes, x: np.ndarray, z: np.ndarray, zorder: float = 5.0) -> None:
     """The dotted path (n,) [m] of the CoM."""
     z = shaped(z, (len(x),), "z")
     ax.plot(x, z, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=zorder)
 
 
-@checked
 def draw_com(ax: Axes, place: np.ndarray) -> None:
     """The mark of the CoM at ``place`` (2,) [m]."""
     look = dict(markersize=6, color=VERMILION)
@@ -236,7 +228,6 @@ def draw_com(ax: Axes, place: np.ndarray) -> None:
     ax.plot(*place, marker="+", zorder=7, **look)
 
 
-@checked
 def equal_scales(ax: Axes) -> None:
     """Equal scales on both axes, everything in view."""
     ax.set_aspect("equal", adjustable="box")
@@ -245,7 +236,6 @@ def equal_scales(ax: Axes) -> None:
 
 # the sheet of a robot
 # ----------------------------------------------------------------------------------------------
-@checked
 @themed
 def robot_sheet(robot: Robot) -> Figure:
     """A robot standing, its moving joints with their roles from the front, and its five links."""

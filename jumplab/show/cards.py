@@ -6,7 +6,6 @@ import base64
 import html
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,7 +58,6 @@ MOST_PRICES = 14  # and prices
 Card = tuple[Table, Picture | None]
 
 
-@checked
 def card(x: Shown) -> str | None:
     """HTML of a result's card; None for what has none."""
     make = next((CARDS[kind.__name__] for kind in type(x).__mro__ if kind.__name__ in CARDS), None)
@@ -72,6 +70,11 @@ def card(x: Shown) -> str | None:
         picture = f'<img src="data:image/png;base64,{png}" style="max-width: 100%">'
     title = html.escape(f"{type(x).__name__}: {x.line()}")
     return f"<div><b>{title}</b>{rows._repr_html_()}{picture}</div>"
+
+
+def _listed(values: Mapping[str, Any], heading: str = "value") -> Table:
+    """Values by name, one below the other."""
+    return table([{"": name, heading: value} for name, value in values.items()])
 
 
 def _of_plan(plan: JumpPlan) -> Card:
@@ -102,17 +105,16 @@ def _of_run(run: SimulationResult) -> Card:
         "verdict": run.reason,
     }
     figure = None if run.robot is None else jump_strobe(run, run.robot)
-    return table([{"": name, "simulated": x} for name, x in simulated.items()]), figure
+    return _listed(simulated, "simulated"), figure
 
 
 def _of_robot(robot: Robot) -> Card:
     rows = []
     for role, pair in robot.joints.items():
         row = {"role": role.replace("_", " "), "joints": ", ".join(pair) or "held"}
-        motor = robot.actuators[pair[0]] if pair else {}
-        columns = {"from [rad]": "lower", "to [rad]": "upper", "N m": "effort", "rad/s": "speed"}
-        rows.append(row | {name: motor.get(key) for name, key in columns.items()})
-    return table(rows), robot_sheet(robot)
+        rows.append(row | (dict(robot.actuators[pair[0]]) if pair else {}))
+    columns = {"role": "role", "joints": "joints", "lower": "from [rad]", "upper": "to [rad]"}
+    return table(rows, columns | {"effort": "N m", "speed": "rad/s"}), robot_sheet(robot)
 
 
 def _of_audit(report: AuditReport) -> Card:
@@ -149,7 +151,6 @@ def _of_clip(report: ClipReport) -> Card:
     return table(rows, columns | {"passed": "passed"}), clip_sheet(report)
 
 
-@checked
 @themed
 def clip_sheet(report: ClipReport) -> Figure:
     """What a judged clip does over time; shaded where no foot carries."""
@@ -246,31 +247,24 @@ def _of_envelope(envelope: Envelope) -> Card:
 
 
 def _of_metrics(m: Metrics) -> Card:
-    rows = [
-        {"": f.name, "value": getattr(m, f.name)}
-        for f in fields(m)
-        if not isinstance(getattr(m, f.name), Mapping)
-    ]
-    return table([row for row in rows if row["value"] not in (None, ())]), None
+    plain = {name: x for name, x in vars(m).items() if not isinstance(x, Mapping)}
+    return _listed({name: x for name, x in plain.items() if x not in (None, ())}), None
 
 
 def _of_task(task: JumpTask) -> Card:
-    rows = [
-        {"": "target", "value": describe_task(task)},
-        {"": "speed at take-off [m/s], upwards", "value": task.takeoff_speed},
-        {"": "time in the air [s], at equal heights", "value": task.flight_time()},
-        {"": "gravity [m/s^2]", "value": task.gravity},
-    ]
-    return table(rows), None
+    rows = {
+        "target": describe_task(task),
+        "speed at take-off [m/s], upwards": task.takeoff_speed,
+        "time in the air [s], at equal heights": task.flight_time(),
+        "gravity [m/s^2]": task.gravity,
+    }
+    return _listed(rows), None
 
 
 def _of_planner(planner: Planner) -> Card:
-    rows = [
-        {"": "robot", "value": planner.robot.line()},
-        {"": "stages built", "value": ", ".join(planner.built) or "none yet"},
-        {"": "limits", "value": str(planner.limits)},
-    ]
-    return table(rows), None
+    built = ", ".join(planner.built) or "none yet"
+    rows = {"robot": planner.robot.line(), "stages built": built, "limits": str(planner.limits)}
+    return _listed(rows), None
 
 
 def _of_rows(rows: Rows) -> Card:

@@ -7,14 +7,12 @@ from importlib import resources
 import matplotlib.colors as mcolors
 from jinja2 import Template
 
-from jumplab.arguments import checked
 from jumplab.show.style import LANDING, VERMILION, describe_task, made_with
 from jumplab.show.tables import table
 from jumplab.show.viewer import Page
 from jumplab.studies.certify import COLUMNS, CONDITIONS, Certificate, ModeReport
 
 
-@checked
 def certificate_page(certificate: Certificate) -> Page:
     """The page of a :class:`jumplab.studies.certify.Certificate`, by ``certificate.html``."""
     title = f"Certificate: {describe_task(certificate.task)}"

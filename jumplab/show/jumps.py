@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jumplab.arguments import checked
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.legs import size
@@ -120,7 +119,6 @@ def _panels(curves: dict[str, tuple], handles: list, height: float) -> tuple[Fig
     return fig, axes
 
 
-@checked
 @themed
 def joint_trajectories(
     tape: Tape,
@@ -145,21 +143,20 @@ def joint_trajectories(
     for column, (title, sides) in zip(axes.T, joints.items(), strict=True):
         motor = motors[sides[0]]
         panels = (
-            (tape.q[:, 7:], motor.lower, motor.upper),
-            (tape.v[:, 6:], -motor.speed, motor.speed),
+            (tape.q[:, 7:], (motor.lower, motor.upper)),
+            (tape.v[:, 6:], (-motor.speed, motor.speed)),
+            (tape.tau, motor.range(tape.v[:, 6 + sides[0]])),
         )
-        if torques:
-            _draw_torques(column[2], tape, motor, sides)
-        for k, (ax, (values, low, high)) in enumerate(zip(column[:2], panels, strict=True)):
+        for ax, (values, edges) in zip(column, panels, strict=False):
             for i, opacity in zip(sides, OPACITIES, strict=False):
                 by_phase(ax, tape.t, values[:, i], tape.phase, alpha=opacity)
-            if guess is not None:
-                row, sign = signs[robot.joint_names[sides[0]]]
-                ax.plot(guess[0], sign * guess[1 + k][:, row], **REFERENCE_STYLE)
             mark_time(ax, [_heel_up_time(tape)])
-            draw_limits(ax, low, high)
-            room = 0.06 * (high - low)
-            ax.set_ylim(low - room, high + room)
+            for edge in edges:
+                ax.plot(tape.t, np.broadcast_to(edge, tape.t.shape), **LIMIT_STYLE)
+        if guess is not None:
+            row, sign = signs[robot.joint_names[sides[0]]]
+            for ax, rows in zip(column, guess[1:], strict=False):
+                ax.plot(guess[0], sign * rows[:, row], **REFERENCE_STYLE)
         column[0].set_title(title.removesuffix(" pitch"), fontsize=8 if len(joints) < 5 else 7)
         column[-1].set_xlabel("time [s]")
     labels = ("angle [rad]", "velocity [rad/s]", "torque [N m]")
@@ -171,16 +168,6 @@ def joint_trajectories(
     return fig
 
 
-def _draw_torques(ax: Axes, tape: Tape, motor: MotorLimits, sides: list[int]) -> None:
-    """Torques of a pair of joints over time, within what their motors give at their speeds."""
-    for i, opacity in zip(sides, OPACITIES, strict=False):
-        by_phase(ax, tape.t, tape.tau[:, i], tape.phase, alpha=opacity)
-    for edge in motor.range(tape.v[:, 6 + sides[0]]):
-        ax.plot(tape.t, edge, **LIMIT_STYLE)
-    mark_time(ax, [_heel_up_time(tape)])
-
-
-@checked
 @themed
 def inertia_and_momentum(tape: Tape) -> Figure:
     """F-9: inertia, CoM velocity and angular momentum of the plan; dashed what stage 1 asked for.
@@ -204,18 +191,16 @@ def inertia_and_momentum(tape: Tape) -> Figure:
 
 # limits
 # ----------------------------------------------------------------------------------------------
-@checked
 @themed
 def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
     """Torque against speed of each joint in its envelope; CoP in the sole and friction used through
     the launch.
 
-    ``limits`` are the planner's (its defaults for the robot if None), drawn dashed inside what the motors could
-    do.
+    ``limits`` are the planner's (its defaults for the robot if None), drawn dashed inside what the
+    motors could do.
     """
     limits = limits or Limits().of_size(size(robot))
     joints = _joints(tape, robot)
-    motors = robot.limits
     panels = [*joints, "cop", "friction"]
     panels += ["."] * (-len(panels) % COLUMNS)
     mosaic = np.reshape(panels, (-1, COLUMNS)).tolist()
@@ -223,7 +208,7 @@ def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
     axes = fig.subplot_mosaic(mosaic)
     for title, sides in joints.items():
         ax = axes[title]
-        _draw_motor(ax, motors[sides[0]], limits)
+        _draw_motor(ax, robot.limits[sides[0]], limits)
         for i, opacity in zip(sides, OPACITIES, strict=False):
             by_phase(ax, tape.v[:, 6 + i], tape.tau[:, i], tape.phase, linewidth=1.1, alpha=opacity)
         ax.set(title=title, ylabel="torque [N m]")
@@ -270,13 +255,13 @@ def _draw_contact(cop: Axes, friction: Axes, tape: Tape, robot: Robot, limits: L
         ax.set(xlabel="time [s]", ylabel=label)
 
 
-@checked
 @themed
 def active(plan: JumpPlan, limits: Limits | None = None) -> Figure:
     """Which limit of a plan binds when: a bar while a joint, a foot or the friction uses all that
     the planner may use, in the colour of the phase.
 
-    ``limits`` are the planner's, its defaults for the robot if None. Bars of left and right are one.
+    ``limits`` are the planner's, its defaults for the robot if None. Bars of left and right are
+    one.
     """
     tape = plan.tape
     rows = _used_up(tape, plan.robot, limits or Limits().of_size(size(plan.robot)))
@@ -328,7 +313,6 @@ def _used_up(tape: Tape, robot: Robot, limits: Limits) -> dict[str, np.ndarray]:
     return rows
 
 
-@checked
 def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
     """Launch's ground reaction over ``t`` (n,) [s], left foot first.
 
@@ -354,7 +338,6 @@ def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
 
 # simulations
 # ----------------------------------------------------------------------------------------------
-@checked
 @themed
 def jump_strobe(record: SimulationResult | Tape, robot: Robot) -> Figure:
     """F-1: a simulated or planned jump in one picture, each phase in its colour, with the CoM's
@@ -405,7 +388,6 @@ def _strip_rows(record: SimulationResult | Tape, height: np.ndarray) -> np.ndarr
     return np.array(rows)
 
 
-@checked
 @themed
 def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     """F-12: CoM position [m] and velocity [m/s], inertia, and L during the launch; dashed the plan,

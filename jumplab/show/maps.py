@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from jumplab.arguments import checked
 from jumplab.errors import InputError, quoted
 from jumplab.show.style import (
     COLUMN_IN,
@@ -45,7 +44,6 @@ AXIS_WORDS = {
 MARKS = (LAUNCH, "o"), (FLIGHT, "s"), (INK, "^"), (LANDING, "D")  # of several reports
 
 
-@checked
 @themed
 def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
     """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much
@@ -106,7 +104,6 @@ def _draw_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: s
     ax.grid(False)
 
 
-@checked
 @themed
 def margin_chart(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     """The largest size of each disturbance that plans tolerate, as a share of the largest tried:

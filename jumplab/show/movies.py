@@ -27,6 +27,7 @@ from jumplab.io.progress import tell
 from jumplab.robot import Robot
 from jumplab.show.shapes import PAINTS, Trace, ground_forces, parts_of, trace
 from jumplab.show.style import INK
+from jumplab.sim.checks import ground_of
 from jumplab.sim.scene import Scene
 from jumplab.stages.plan import JumpPlan
 
@@ -88,7 +89,6 @@ class Movie:
         return f"<video {look} controls loop autoplay muted playsinline></video>"
 
 
-@checked
 def movie(
     of: Robot | JumpPlan | SimulationResult,
     record: Record | Motion | None = None,
@@ -124,7 +124,7 @@ def movie(
     pressed = ground_forces(whole, rate, way, scene) if forces else None
     size = KINDS[kind][1]
     pictures = []
-    name, renderer = _renderer(_world(robot, scene, _marks(robot, way)), size)
+    name, renderer = _renderer(_world(robot, scene, way.toes(robot)[[0, -1]].tolist()), size)
     with renderer:
         for k, look in enumerate(looks):
             tell("drawing frame", k + 1, len(looks))
@@ -136,8 +136,8 @@ def movie(
             words = f"{motion.t[k] - motion.t[0]:.2f} s, half speed"
             ImageDraw.Draw(picture).text((10, size[1] - 22), words, fill=INK)
             pictures.append(picture)
-    count = len(pictures)
-    return Movie(_encode(pictures, kind), kind, count, count / RATES[kind], name)
+    lasts_s = len(pictures) / RATES[kind]
+    return Movie(_encode(pictures, kind), kind, len(pictures), lasts_s, name)
 
 
 def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Scene]:
@@ -152,8 +152,7 @@ def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Sce
         return of.robot, of.tape, scene or Scene.of_plan(of.summary, of.robot)
     if of.robot is None:
         raise InputError("the robot of this simulation is not known; give it, then the simulation")
-    ground = of.settings.get("ground")
-    return of.robot, of, scene or (Scene.from_json(ground) if ground else Scene.flat())
+    return of.robot, of, scene or ground_of(of)
 
 
 def _camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
@@ -177,12 +176,6 @@ def _camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
     return looks, half / np.tan(np.radians(OPENING_DEG) / 2)
 
 
-def _marks(robot: Robot, way: Trace) -> tuple[float, float]:
-    """Where the toes are first and last, along x [m]."""
-    toes = (way.feet @ [*robot.foot.tip, 1.0])[..., 0].mean(axis=1)
-    return float(toes[0]), float(toes[-1])
-
-
 def _arrows(pressed: np.ndarray, robot: Robot) -> list[tuple[np.ndarray, np.ndarray]]:
     """Ends of the arrows of both feet [m], from places and forces (2, 6) [m, N]."""
     scale = ARROW_M / (robot.total_mass * robot.gravity)
@@ -202,9 +195,9 @@ def write_movie(
 def _encode(pictures: Sequence[Image.Image], kind: str) -> bytes:
     if kind == "mp4":
         coding = dict(codec="libx264", pixelformat="yuv420p", macro_block_size=2, fps=RATES[kind])
-        frames = np.stack([np.asarray(picture) for picture in pictures])
-        return images.imwrite("<bytes>", frames, extension=".mp4", plugin="FFMPEG", **coding)
-    some = np.vstack([np.asarray(p) for p in pictures[:: max(1, len(pictures) // 6)]])
+        where = dict(extension=".mp4", plugin="FFMPEG")
+        return images.imwrite("<bytes>", np.stack(pictures), **where, **coding)
+    some = np.vstack(pictures[:: max(1, len(pictures) // 6)])
     palette = Image.fromarray(some).quantize(COLORS)
     plain = dict(palette=palette, dither=Image.Dither.NONE)
     first, *others = (picture.quantize(**plain) for picture in pictures)

@@ -17,9 +17,11 @@ import pinocchio as pin
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import ConvexHull
 
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import RobotError
 from jumplab.io.motion import CONTACT_FORCE_N, Motion
 from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet
 from jumplab.robot.files import LEG, SHIPPED
 from jumplab.robot_import.checkup import examine
 from jumplab.show.style import PHASE_COLORS, tint
@@ -70,6 +72,11 @@ def parts_of(robot: Robot) -> tuple[list[Part], list[str]]:
     return meshes or rounded_body(robot), notes
 
 
+def placed(points: np.ndarray, place: pin.SE3) -> np.ndarray:
+    """Points (n, 3) of a frame as they are seen from where its ``place`` is [m]."""
+    return points @ place.rotation.T + place.translation
+
+
 class Trace(NamedTuple):
     """Where a robot is at N states."""
 
@@ -78,18 +85,19 @@ class Trace(NamedTuple):
     feet: np.ndarray  # (N, 2, 4, 4) homogeneous transforms of left and right foot link [m]
     com: np.ndarray  # (N, 3) [m]
 
+    def toes(self, robot: Robot) -> np.ndarray:
+        """How far ahead the toes are (N,), the mean of both [m]."""
+        return (self.feet @ [*robot.foot.tip, 1.0])[..., 0].mean(axis=1)
+
 
 def trace(robot: Robot, states: np.ndarray) -> Trace:
     """Joints, feet and CoM at states (N, nq)."""
-    model = robot.model
-    data = model.createData()
-    frames = [model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames]
+    gauge = Gauge(robot)
     rows = []
     for q in states:
-        com = pin.centerOfMass(model, data, q).copy()
-        joints = [pin.SE3ToXYZQUAT(data.oMi[j]) for j in range(1, model.njoints)]
-        feet = [pin.updateFramePlacement(model, data, frame).homogeneous for frame in frames]
-        rows.append((joints, feet, com))
+        feet = [foot.homogeneous for foot in gauge.places(q)]
+        joints = [pin.SE3ToXYZQUAT(place) for place in list(gauge.data.oMi)[1:]]
+        rows.append((joints, feet, gauge.com(q)))
     return Trace(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
@@ -145,8 +153,7 @@ def _published(robot: Robot) -> tuple[list[Part], list[str]]:
         place = like.lumped.place(link)
         joint = robot.model.frames[robot.model.getFrameId(body, pin.FrameType.BODY)].parentJoint
         for points, triangles in like.tree.meshes(link):
-            moved = points @ place.rotation.T + place.translation
-            parts.append(Part(joint, _kind(robot, joint), moved, triangles, True))
+            parts.append(Part(joint, _kind(robot, joint), placed(points, place), triangles, True))
     if not parts:
         return [], ["drawn from boxes: its meshes are missing"]
     cell = CELL_M
@@ -168,11 +175,7 @@ def _coarser(part: Part, cell_m: float) -> Part:
 
 
 def _kind(robot: Robot, joint: int) -> str:
-    frames = [
-        robot.model.frames[robot.model.getFrameId(name, pin.FrameType.BODY)]
-        for name in robot.foot.frames
-    ]
-    feet = [frame.parentJoint for frame in frames]
+    feet = [foot.joint for foot in on_feet(robot, np.zeros(3))]
     return "trunk" if joint == 1 else "rest" if joint in feet else "limb"
 
 
@@ -180,21 +183,24 @@ def _kind(robot: Robot, joint: int) -> str:
 # ----------------------------------------------------------------------------------------------
 class _Box(NamedTuple):
     joint: int
-    middle: np.ndarray  # (3,) in the joint's frame [m]
-    turn: np.ndarray  # (3, 3)
+    place: pin.SE3  # of its middle, in the joint's frame [m]
     half: np.ndarray  # (3,) [m]
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(3,) in the joint's frame [m]."""
+        return self.place.translation
 
     def rounded(self, share: float) -> np.ndarray:
         """Points (n, 3) of the box, the radius of its edges a ``share`` of the least width."""
         radius = share * 2 * self.half.min()
         inner = zip(radius - self.half, self.half - radius, strict=True)
         corners = np.array(list(itertools.product(*inner)))
-        points = (corners[:, None] + radius * BALL).reshape(-1, 3)
-        return points @ self.turn.T + self.middle
+        return placed((corners[:, None] + radius * BALL).reshape(-1, 3), self.place)
 
     def inside(self, share: np.ndarray) -> np.ndarray:
         """Points (n, 3) given in half sizes of the box."""
-        return (share * self.half) @ self.turn.T + self.middle
+        return placed(share * self.half, self.place)
 
 
 def _boxes(robot: Robot) -> list[_Box]:
@@ -214,9 +220,8 @@ def _boxes(robot: Robot) -> list[_Box]:
     for shape in geometry.geometryObjects:
         shape.geometry.computeLocalAABB()
         box = shape.geometry.aabb_local
-        place = shape.placement
-        middle = place.act((box.max_ + box.min_) / 2)
-        boxes.append(_Box(shape.parentJoint, middle, place.rotation, (box.max_ - box.min_) / 2))
+        place = shape.placement * pin.SE3(np.eye(3), (box.max_ + box.min_) / 2)
+        boxes.append(_Box(shape.parentJoint, place, (box.max_ - box.min_) / 2))
     return boxes
 
 

@@ -25,7 +25,7 @@ from matplotlib.colors import is_color_like, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jumplab.arguments import checked, shaped
+from jumplab.arguments import shaped
 from jumplab.errors import InputError, quoted
 from jumplab.io.folder import versions, write_file
 from jumplab.robot import Robot
@@ -141,7 +141,6 @@ def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
     return buffer.getvalue()
 
 
-@checked
 @themed
 def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
     """An empty figure of the style, ``width`` and ``height`` [in]."""
@@ -152,13 +151,11 @@ def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
     return Picture(figsize=(width, height))
 
 
-@checked
 def tint(color: Color, share: float) -> tuple[float, float, float]:
     """(r, g, b) of ``color`` mixed with white: share 1 is the colour itself, 0 is white."""
     return tuple(1 - share * (1 - x) for x in _mixed(color, share))
 
 
-@checked
 def shade(color: Color, share: float) -> tuple[float, float, float]:
     """(r, g, b) of ``color`` mixed with black: share 1 is the colour itself, 0 is black."""
     return tuple(share * x for x in _mixed(color, share))
@@ -175,7 +172,6 @@ def _mixed(color: Color, share: float) -> tuple[float, float, float]:
 
 # curves of a jump
 # -----------------------------------------------------------------------------------------------
-@checked
 def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs) -> list[Line2D]:
     """Plot ``y`` (N,) over ``t`` (N,), each run of one ``phase`` (N,) in that phase's colour.
 
@@ -195,7 +191,6 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
     return lines
 
 
-@checked
 def compare(
     ax: Axes,
     curve: tuple,
@@ -212,21 +207,18 @@ def compare(
     ax.set_ylabel(label)
 
 
-@checked
 def mark_time(ax: Axes, times: Iterable[float]) -> None:
     """Thin dotted vertical lines at the ``times`` [s] where phases change."""
     for t in times:
         ax.axvline(t, color=LIMIT, linewidth=0.6, linestyle=(0, (1, 2)), zorder=0)
 
 
-@checked
 def limits(ax: Axes, *bounds: float) -> None:
     """Thin horizontal lines at bounds."""
     for bound in bounds:
         ax.axhline(bound, **LIMIT_STYLE)
 
 
-@checked
 def phase_handles(
     *phases: str, reference: str | None = None, limit: str | None = None
 ) -> list[Line2D]:
@@ -237,13 +229,11 @@ def phase_handles(
     return handles
 
 
-@checked
 def legend_above(fig: Figure, handles: list[Artist]) -> None:
     """One legend over all panels, outside of them."""
     fig.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
 
 
-@checked
 def panel_letters(axes: Iterable[Axes]) -> None:
     """(a), (b), ... before the panels' titles."""
     for letter, ax in zip("abcdefghijklmnop", axes, strict=False):
@@ -251,7 +241,6 @@ def panel_letters(axes: Iterable[Axes]) -> None:
         ax.set_title(title.rstrip())
 
 
-@checked
 def bare(ax: Axes) -> None:
     """No frame, ticks or grid: for pictures rather than plots."""
     # hidden ticks would still be laid out, which takes longer than the picture
@@ -262,7 +251,6 @@ def bare(ax: Axes) -> None:
 
 # saving
 # ----------------------------------------------------------------------------------------------
-@checked
 def save_figure(
     fig: Figure,
     name: str,
@@ -313,7 +301,6 @@ def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -
     return "\n".join([*lines, f"Made with {made_with()}.", ""])
 
 
-@checked
 def describe_task(task: JumpTask) -> str:
     """The target in words, such as "1.00 m forward, CoM rise 0.50 m"."""
     words = [f"{abs(task.distance_m):.2f} m {'forward' if task.distance_m >= 0 else 'backward'}"]

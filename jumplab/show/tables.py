@@ -50,7 +50,6 @@ class Table:
         return part(lines[:MOST_ROWS]) + folded * bool(rest)
 
 
-@checked
 def table(
     rows: Iterable[Mapping],
     columns: Iterable[str] | Mapping[str, str] | None = None,

@@ -63,7 +63,6 @@ class Page:
         )
 
 
-@checked
 def page(
     robot: Robot,
     *,
@@ -201,7 +200,7 @@ def _values(
     its torque as a share of the limit.
     """
     height = way.com[:, 2]
-    toes = (way.feet @ [*robot.foot.tip, 1.0])[..., 0].mean(axis=1)
+    toes = way.toes(robot)
     takeoff = int(np.argmax(whole.phase == "flight"))
     start = trace(robot, whole.q[[takeoff]]).com[0, 2]
     names = robot.joint_names

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -24,19 +24,16 @@ from jumplab.sim.scene import REACH_M, Contacts
 
 @dataclass(frozen=True)
 class Contact:
-    """How contacts are solved, with PyBullet's names in brackets; None leaves its own default."""
+    """How contacts are solved: options of PyBullet's engine, which has defaults of its own."""
 
-    iterations: int | None = None  # at most (numSolverIterations)
-    # [1] share of a penetration that is taken back in a step (contactERP)
-    fading: float | None = None
-    depth_m: float | None = None  # [m] as deep as a contact may rest (contactSlop)
+    options: dict[str, float] = field(default_factory=dict)
     substeps: int = 1  # in one step of the simulation
 
 
 # With 200 iterations, what is left unsolved tips the robot sideways by 2.5 mrad. With the default
 # fading, feet bounce off an impact; this one takes 10 ms. Boxes at a depth of zero lose the contact
 # of a light toe by rounding
-HARD = Contact(iterations=1000, fading=0.1, depth_m=1e-4)
+HARD = Contact({"numSolverIterations": 1000, "contactERP": 0.1, "contactSlop": 1e-4})
 # friction combines as a product: the robot's coefficient is the effective one
 GROUND_FRICTION = 1.0
 FASTEST = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
@@ -132,14 +129,11 @@ class BulletEngine(Engine):
         self._client = bullet.connect(bullet.DIRECT)
         self._bullet = _Client(self._client)
         self._bullet.setGravity(0, 0, -self.robot.gravity)
-        contact = dict(
-            numSolverIterations=self.contact.iterations,
-            contactERP=self.contact.fading,
-            contactSlop=self.contact.depth_m,
-        )
-        told = {name: value for name, value in contact.items() if value is not None}
         self._bullet.setPhysicsEngineParameter(
-            fixedTimeStep=STEP_S, numSubSteps=0, deterministicOverlappingPairs=1, **told
+            fixedTimeStep=STEP_S,
+            numSubSteps=0,
+            deterministicOverlappingPairs=1,
+            **self.contact.options,
         )
         pairs = zip(self.scene.boxes(), self.scene.blocks, strict=True)
         self._ground = [self._add_block(*box, block.soft_m) for box, block in pairs]
@@ -192,9 +186,6 @@ class BulletEngine(Engine):
                 "align it with its link"
             )
 
-    def _dynamics(self) -> list[tuple]:
-        return [self._bullet.getDynamicsInfo(self._body, i - 1) for i in range(len(self.links))]
-
     def _set_dynamics(self, friction: float) -> None:
         change = partial(self._bullet.changeDynamics, self._body)
         for link in range(-1, len(self.links) - 1):
@@ -229,7 +220,10 @@ class BulletEngine(Engine):
     def kept(self) -> Kept:
         """What the engine has; damping, armature and friction of the motors come in :meth:`step`,
         and the inertia that links are lent is given back there."""
-        rows = dict(zip(self.links, self._dynamics(), strict=True))
+        rows = {
+            link: self._bullet.getDynamicsInfo(self._body, i)
+            for i, link in enumerate(self.links, -1)
+        }
         inertials = {link: inertial(r[0], r[3], r[4], r[2]) for link, r in rows.items()}
         for link, more in self._armature.lent.items():
             inertials[link] -= pin.Inertia(0.0, np.zeros(3), more * np.eye(3))

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumplab.control.kinematics import Gauge
+from jumplab.control.kinematics import rotation
 from jumplab.robot.legs import size
 from jumplab.robot.stance import knees
 from jumplab.sim import STEP_S
 from jumplab.sim.checks import LOADED_N, friction_used, ground_of
-from jumplab.sim.result import SimulationResult, motors_spent, stray
+from jumplab.sim.result import SimulationResult, motors_spent
 
 CAUSES = ("slip", "over-rotation", "knee stop", "torque", "tip", "other")
 # [1] of the friction, used for so long: the impact of a sound landing slides less
@@ -52,8 +52,7 @@ def signs(result: SimulationResult) -> tuple[Sign, ...]:
         return ()
     if result.robot is None:
         raise ValueError("the log's robot is not known")
-    lying = np.append(stray(result, result.robot).any(axis=1), True)
-    until = int(np.argmax(lying))
+    until = int(np.argmax([*result.stray.any(axis=1), True]))
     rows = {"slip": _slip(result, until), "torque": _torque(result, until)}
     if (result.phase == "landing").any():
         down = int(np.argmax(result.phase == "landing"))
@@ -76,25 +75,21 @@ def _lasting(flags: np.ndarray, time_s: float) -> int | None:
 
 
 def _slip(result: SimulationResult, until: int) -> int | None:
-    gauge = Gauge(result.robot)
     least = size(result.robot).of(LOADED_N, "N")
     sliding = result.foot_wrench[:until, :, 2] > least
     row, side = np.nonzero(sliding)
-    if len(row):
-        feet = np.array([[foot.translation for foot in gauge.places(q)] for q in result.q[:until]])
-        force = result.foot_wrench[row, side, :3]
-        used = friction_used(force, feet[row, side], ground_of(result))
-        sliding[row, side] = used >= SLIDING * result.settings["perturbation"]["friction"]
+    force = result.foot_wrench[row, side, :3]
+    used = friction_used(force, result.feet[row, side, :3, 3], ground_of(result))
+    sliding[row, side] = used >= SLIDING * result.settings["perturbation"]["friction"]
     return _lasting(sliding, SLIP_S)
 
 
 def _over_rotation(result: SimulationResult, down: int) -> int | None:
     """Whether trunk or soles are turned too far at the touchdown."""
-    gauge = Gauge(result.robot)
-    soles = [foot.rotation[2, 2] for foot in gauge.places(result.q[down])]
+    soles = result.feet[down, :, 2, 2]
     # up, seen by the trunk, as it is in the stance
     pitch = result.robot.stance["trunk_pitch_rad"]
-    trunk = gauge.data.oMi[1].rotation[2] @ [-np.sin(pitch), 0.0, np.cos(pitch)]
+    trunk = rotation(result.q[down, 3:7])[2] @ [-np.sin(pitch), 0.0, np.cos(pitch)]
     return down if trunk < np.cos(TURNED_RAD) or min(soles) < np.cos(SOLE_RAD) else None
 
 
@@ -114,14 +109,15 @@ def _torque(result: SimulationResult, until: int) -> int | None:
 
 def _tip(result: SimulationResult, down: int, until: int) -> int | None:
     """From when on the capture point stays beyond the soles."""
-    gauge = Gauge(result.robot)
-    last = down
-    for row in range(down, until):
-        corners = gauge.corners(result.q[row])
-        com = result.com[row]
-        height = max(float(com[2] - corners[:, 2].min()), STEP_S)
-        rests = com + result.com_velocity[row] * np.sqrt(height / result.robot.gravity)
-        beyond = np.maximum(corners.min(axis=0) - rests, rests - corners.max(axis=0))
-        if (beyond[:2] <= 0).all():
-            last = row + 1
+    rows = slice(down, until)
+    corners = np.column_stack([result.robot.foot.corners, np.ones(4)])
+    feet = result.feet[rows] @ corners.T  # (rows, 2, 4, corners of a sole)
+    low = feet.min(axis=(1, 3))[:, :3]
+    high = feet.max(axis=(1, 3))[:, :3]
+    com = result.com[rows]
+    height = np.maximum(com[:, 2] - low[:, 2], STEP_S)
+    pendulum_s = np.sqrt(height / result.robot.gravity)
+    rests = com + result.com_velocity[rows] * pendulum_s[:, None]
+    inside = ((low <= rests) & (rests <= high))[:, :2].all(axis=1)
+    last = down + int(np.flatnonzero([True, *inside])[-1])
     return last if last < until else None

@@ -10,18 +10,18 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab.control.kinematics import Gauge, rotation
-from jumplab.robot import Robot
 from jumplab.robot.contact import WORLD, on_feet
 from jumplab.robot.description import Foot
 from jumplab.robot.legs import size
 from jumplab.sim import CONTACTS, STEP_S
 from jumplab.sim.armature import Armature
-from jumplab.sim.result import STAND_S, Finding, SimulationResult, stray
+from jumplab.sim.result import STAND_S, Finding, SimulationResult
 from jumplab.sim.scene import Scene
 
 # name -> limit, unit, what more would hide; where engines take substeps, their limit
@@ -39,18 +39,21 @@ LOADED_N = 50.0  # of a 42 kg robot: below it, CoP and friction ratio are roundi
 FACING = 0.7
 
 
-def check(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
-    """All findings about ``result`` of ``robot``: the planned one with the stated perturbation."""
+def check(result: SimulationResult) -> tuple[Finding, ...]:
+    """All findings about a ``result``, whose robot is the planned one with the stated
+    perturbation.
+    """
+    robot = result.robot
     engine = result.settings["engine"]
     stated = result.settings["perturbation"]["friction"]
-    base, joints = unexplained(result, robot)
+    base, joints = unexplained(result)
     low, high = robot.limits.range(result.v[:, 6:])
-    slip, outside = _feet(result, robot)
+    slip, outside = _feet(result)
     values = {
         "unexplained force on the body": worst(base[:, :3]),
         "unexplained moment on the body": worst(base[:, 3:]),
         "unexplained joint torque": worst(joints),
-        "largest jump of the state": _largest_jump(result, robot),
+        "largest jump of the state": _largest_jump(result),
         "unevenness of time": np.abs(np.diff(result.t) - STEP_S).max(initial=0.0),
         "torque beyond the motors": np.maximum(result.tau - high, low - result.tau).max(
             initial=0.0
@@ -67,7 +70,7 @@ def check(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
         "gravity read back, less the target's": np.abs(
             engine["gravity"] - robot.model.gravity.linear
         ).max(),
-        "claimed landing, short of 3 s by": _short_landing(result, robot),
+        "claimed landing, short of 3 s by": _short_landing(result),
     }
     found = []
     for name, (limit, unit, hides, *substepped) in QUESTIONS.items():
@@ -77,7 +80,7 @@ def check(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     return tuple(found)
 
 
-def _largest_jump(result: SimulationResult, robot: Robot) -> float:
+def _largest_jump(result: SimulationResult) -> float:
     """How far a state is from where its velocities lead [m, rad].
 
     Within a step of n semi-implicit ones, the velocity that moves the robot lies about v + (1 + 1 /
@@ -85,7 +88,7 @@ def _largest_jump(result: SimulationResult, robot: Robot) -> float:
     step and undo.
     """
     least = 1 / result.settings["engine"]["substeps"]
-    model = robot.model
+    model = result.robot.model
     change = np.diff(result.v, axis=0)
     mean = result.v[:-1] + (1 + least) / 2 * change
     room = SWING * (1 - least) * np.abs(change).max(axis=1) * STEP_S
@@ -93,30 +96,30 @@ def _largest_jump(result: SimulationResult, robot: Robot) -> float:
     miss = [pin.difference(model, a, b) for a, b in zip(there, result.q[1:], strict=True)]
     left = np.abs(miss) - room[:, None]
     for k in np.flatnonzero(left.max(axis=1, initial=0.0) > JUMP_M) if least < 1 else ():
-        left[k] -= (1 - least) * STEP_S * _kick(result, robot, k)
+        left[k] -= (1 - least) * STEP_S * _kick(result, k)
     return float(left.max(initial=0.0))
 
 
-def _kick(result: SimulationResult, robot: Robot, row: int) -> np.ndarray:
+def _kick(result: SimulationResult, row: int) -> np.ndarray:
     """By how much (nv,) one step's forces change velocities at most, wherever along the soles they
     act first.
     """
+    robot = result.robot
     model = robot.model
-    data = robot.model.createData()
-    q = result.q[row]
-    mass = pin.crba(model, data, q)
-    pin.computeJointJacobians(model, data, q)
+    data = model.createData()
+    mass = pin.crba(model, data, result.q[row])
+    pin.computeJointJacobians(model, data, result.q[row])
     kick = np.zeros(model.nv)
     feet = on_feet(robot, np.zeros(3))
     for foot, wrench in zip(feet, result.foot_wrench[row], strict=True):
         slope = pin.getFrameJacobian(model, data, foot.joint, foot.placement, WORLD)
-        places = np.array([wrench, wrench, wrench])
+        places = np.tile(wrench, (3, 1))
         places[1:, 4] = -np.array([robot.foot.heel, robot.foot.toe]) * wrench[2]
         kick += np.abs(np.linalg.solve(mass, STEP_S * slope.T @ places.T)).max(axis=1)
     return kick
 
 
-def _pushes(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+def _pushes(result: SimulationResult) -> tuple[np.ndarray, np.ndarray]:
     """Stated external forces (N, 3) in every step [N], and the place (3,) in the base link's frame
     on which they act.
 
@@ -130,19 +133,22 @@ def _pushes(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndar
     return force, np.array(result.settings.get("push_place_m", (0.0, 0.0, 0.0)))
 
 
-def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+def unexplained(result: SimulationResult) -> tuple[np.ndarray, np.ndarray]:
     """Generalised forces that neither torques nor foot forces explain: on the base (N - 1, 6), in
     the joints.
 
     Zero where the log does not say what acted: when other links touch the ground, in joints at
     their stops, and in all joints while links press on each other.
     """
+    robot = result.robot
     model = robot.model
-    data = robot.model.createData()
+    motors = robot.limits
+    engine = result.settings["engine"]
+    data = model.createData()
     feet = on_feet(robot, np.zeros(3))
-    states = _steps(result, robot)
+    states = _steps(result)
     left = np.empty_like(states[2])
-    pushes, place = _pushes(result, robot)
+    pushes, place = _pushes(result)
     for k, (q, v, a) in enumerate(zip(*states, strict=True)):
         left[k] = pin.rnea(model, data, q, v, a)
         pin.computeJointJacobians(model, data, q)
@@ -153,27 +159,26 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
         if pushes[k].any():
             force = rotation(q[3:7]).T @ pushes[k]
             left[k, :6] -= [*force, *np.cross(place, force)]
-    if result.settings["engine"]["substeps"] > 1:
-        left[:, :6] = _momentum_unexplained(result, robot)
+    if engine["substeps"] > 1:
+        left[:, :6] = _momentum_unexplained(result)
     left[:, 6:] -= result.tau[:-1]
-    if result.settings["engine"].get("late_armature"):
+    if engine.get("late_armature"):
         left -= Armature(robot).late(result.q, result.v)
-    if robot.limits.lossy:
-        left[:, 6:] = _rubbed(left[:, 6:], result, robot)
-    left[stray(result, robot)[:-1].any(axis=1)] = 0.0
-    motors = robot.limits
+    if motors.lossy:
+        left[:, 6:] = _rubbed(left[:, 6:], result)
+    left[result.stray[:-1].any(axis=1)] = 0.0
     angle = result.q[:-1, 7:]
     at_stop = (angle < motors.lower + STOP_RAD) | (angle > motors.upper - STOP_RAD)
     return left[:, :6], np.where(at_stop | result.colliding[:-1, None], 0.0, left[:, 6:])
 
 
-def _rubbed(left: np.ndarray, result: SimulationResult, robot: Robot) -> np.ndarray:
+def _rubbed(left: np.ndarray, result: SimulationResult) -> np.ndarray:
     """What the motors' friction does not explain of joint torques (N - 1, nv - 6).
 
     A joint that hardly moves within a step, or turns back, is held by anything up to its dry
     friction.
     """
-    motors = robot.limits
+    motors = result.robot.limits
     before = result.v[:-1, 6:]
     after = result.v[1:, 6:]
     left = left + motors.damping * (before + after) / 2
@@ -182,29 +187,29 @@ def _rubbed(left: np.ndarray, result: SimulationResult, robot: Robot) -> np.ndar
     return np.where(slides, left + motors.friction * np.sign(before), held)
 
 
-def _momentum_unexplained(result: SimulationResult, robot: Robot) -> np.ndarray:
+def _momentum_unexplained(result: SimulationResult) -> np.ndarray:
     """Force, and moment about the world's origin, (N - 1, 6) that momentum says and the ground does
     not.
     """
+    robot = result.robot
     gauge = Gauge(robot)
     weight = robot.total_mass * robot.model.gravity.linear
-    motions = [gauge.motion(*row) for row in zip(result.q, result.v, strict=True)]
-    com = np.array([now.com for now in motions])
-    linear = robot.total_mass * np.array([now.velocity for now in motions])
-    spin = np.array([now.momentum for now in motions]) + np.cross(com, linear)
-    pushes, arm = _pushes(result, robot)
+    motions = [gauge.motion(*row)[1:4] for row in zip(result.q, result.v, strict=True)]
+    com, velocity, spin = np.array(motions).swapaxes(0, 1)
+    linear = robot.total_mass * velocity
+    spin = spin + np.cross(com, linear)
+    pushes, arm = _pushes(result)
     pushed = [q[:3] + rotation(q[3:7]) @ arm for q in result.q]
-    feet = np.array([[foot.translation for foot in gauge.places(q)] for q in result.q])
     forces = result.foot_wrench[:, :, :3]
-    moments = np.cross(pushed, pushes)
-    moments = moments + (result.foot_wrench[:, :, 3:] + np.cross(feet, forces)).sum(axis=1)
+    turned = result.foot_wrench[:, :, 3:] + np.cross(result.feet[:, :, :3, 3], forces)
+    moments = np.cross(pushed, pushes) + turned.sum(axis=1)
     turning = np.cross(com, weight)  # by the weight
     moments[:-1] += (turning[:-1] + turning[1:]) / 2
     acting = np.hstack([weight + pushes + forces.sum(axis=1), moments])
     return np.diff(np.hstack([linear, spin]), axis=0) / STEP_S - acting[:-1]
 
 
-def _steps(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _steps(result: SimulationResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Configuration (N - 1, nq), velocity and acceleration (N - 1, nv) for which each step solved
     the mechanics.
 
@@ -213,10 +218,11 @@ def _steps(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarr
     integrates: differences of the twist in the base's own axes, which turn within the step, would
     be off by 17 N in a flip, those of the other point by 1 to 4 N in a fall.
     """
-    share = 0.0 if result.settings["engine"]["substeps"] == 1 else 0.5
-    model = robot.model
+    engine = result.settings["engine"]
+    share = 0.0 if engine["substeps"] == 1 else 0.5
+    model = result.robot.model
     # to the point of the base whose velocity the engine keeps, base axes
-    arm = model.inertias[1].lever * result.settings["engine"].get("keeps_com", True)
+    arm = model.inertias[1].lever * engine.get("keeps_com", True)
     pairs = zip(result.q[:-1], result.q[1:], strict=True)
     q = np.array([pin.interpolate(model, *pair, share) for pair in pairs])
     turns, turn = (np.array([rotation(row[3:7]) for row in x]) for x in (result.q, q))
@@ -243,7 +249,7 @@ def worst(force: np.ndarray) -> float:
     return float(np.abs(total[window:] - total[:-window]).max(initial=0.0) / max(1, window))
 
 
-def _feet(result: SimulationResult, robot: Robot) -> tuple[float, float]:
+def _feet(result: SimulationResult) -> tuple[float, float]:
     """From the measured wrenches, the most friction that a foot uses [1], and how far its CoP ever
     lies outside the sole [m].
     """
@@ -252,23 +258,19 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[float, float]:
     if not len(loaded):
         return 0.0, 0.0
     ground = ground_of(result)
-    hard = _hard(result)
-    gauge = Gauge(robot)
-    feet = np.array([[foot.homogeneous for foot in gauge.places(q)] for q in result.q])
+    hard = result.settings["engine"].get("contact", CONTACTS[0]) == CONTACTS[0]
+    foot = result.robot.foot
     wrench = result.foot_wrench[loaded, side]
     # a foot may move within a step: where it is at both ends of it
-    ends = feet[loaded, side], feet[loaded + 1, side]
-    before, _ = ends
+    ends = result.feet[loaded, side], result.feet[loaded + 1, side]
+    before = ends[0]
     slip = friction_used(wrench[:, :3], before[:, :3, 3], ground)
-    sunk = np.zeros((1, len(wrench)))
-    least = 0.0
-    if not (hard and ground.plain):
-        corners = before[:, None, :3, 3] + robot.foot.corners @ before[:, :3, :3].swapaxes(1, 2)
-        sunk = np.array([sunk[0], ground.depth_of(corners, soft=hard)])
-        # usual contacts act in the middle of the depth, beyond the tip of a tilted sole
-        least = 0.0 if hard else sunk[1] / 2
+    corners = before[:, None, :3, 3] + foot.corners @ before[:, :3, :3].swapaxes(1, 2)
+    sunk = ground.depth_of(corners, soft=hard)
+    # usual contacts act in the middle of the depth, beyond the tip of a tilted sole
+    least = 0.0 if hard else sunk / 2
     beyond = [
-        _outside(robot.foot, before, end, wrench, deep) - least for end in ends for deep in sunk
+        _outside(foot, before, end, wrench, deep) - least for end in ends for deep in (0.0, sunk)
     ]
     # a foot that lies on its side presses with that
     flat = before[:, 2, 2] >= FACING
@@ -281,23 +283,17 @@ def ground_of(result: SimulationResult) -> Scene:
     return Scene.flat() if ground is None else Scene.from_json(ground)
 
 
-def _hard(result: SimulationResult) -> bool:
-    return result.settings["engine"].get("contact", CONTACTS[0]) == CONTACTS[0]
-
-
 def friction_used(force: np.ndarray, place: np.ndarray, ground: Scene) -> np.ndarray:
     """Friction (k,) that forces (k, 3) on feet at places (k, 3) use, along the ground there over
     across it [1].
     """
-    up = np.array([[0.0, 0.0, 1.0]])
-    if not ground.plain:
-        up = ground.normals_at(place)
+    up = ground.normals_at(place)
     across = (force * up).sum(axis=1)
     return np.linalg.norm(force - across[:, None] * up, axis=1) / across
 
 
 def _outside(
-    foot: Foot, origin: np.ndarray, place: np.ndarray, wrench: np.ndarray, deep: np.ndarray
+    foot: Foot, origin: np.ndarray, place: np.ndarray, wrench: np.ndarray, deep: Any
 ) -> np.ndarray:
     """How far (k,) the CoP of each ``wrench`` (k, 6) about ``origin`` (k, 4, 4) lies outside the
     sole of a foot at ``place`` (k, 4, 4) [m].
@@ -315,11 +311,8 @@ def _outside(
     return np.max([foot.heel - x, x - foot.toe, aside], axis=0)
 
 
-def _short_landing(result: SimulationResult, robot: Robot) -> float:
+def _short_landing(result: SimulationResult) -> float:
     """Seconds that a claimed landing falls short of standing on the feet alone."""
-    down = np.flatnonzero(result.phase == "landing")
-    stood = 0.0
-    if len(down):
-        lying = np.append(stray(result, robot)[down[0] :].any(axis=1), True)
-        stood = STEP_S * float(np.argmax(lying))
+    lying = result.stray[result.phase == "landing"].any(axis=1)
+    stood = STEP_S * float(np.argmax([*lying, True]))
     return max(0.0, STAND_S - stood) if result.metrics.landed else 0.0

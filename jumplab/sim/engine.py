@@ -209,7 +209,8 @@ class Engine(ABC):
             gravity=kept.gravity,
             self_collision=self._solid,
             beyond_sole_m=self._beyond_sole(),
-        ) | ({"late_armature": True} if self.late_armature else {})
+            late_armature=self.late_armature,
+        )
 
     def _compare(self, friction: float) -> None:
         kept = self.kept()

@@ -5,17 +5,16 @@ nothing is reset.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.arguments import checked
 from jumplab.control import STAND_S
 from jumplab.control.controller import Controller, Hardware
-from jumplab.control.kinematics import Gauge, State, about_vertical, rotation, turned
+from jumplab.control.kinematics import Gauge, State
 from jumplab.control.servo import Drive
 from jumplab.errors import InputError
 from jumplab.io.progress import tell
@@ -138,8 +137,9 @@ class Run:
         if self.ground is not self.scene or not self.ground.plain:
             settings["ground"] = asdict(self.ground)
         if self.pushes:  # what the checks know of them
-            pushes = [replace(push, step=push.step - self._begun) for push in self.pushes]
-            settings["pushes"] = [asdict(push) for push in pushes]
+            settings["pushes"] = [
+                asdict(replace(push, step=push.step - self._begun)) for push in self.pushes
+            ]
             settings["push_place_m"] = self.push_place.tolist()
         higher_m = self.ground.height_of(goal, self.robot, self.scene)
         result = record(
@@ -152,39 +152,15 @@ class Run:
             solves=solves,
             settings=settings,
         )
-        return replace(result, checks=check(result, self.real))
+        return replace(result, checks=check(result))
 
 
-@dataclass(frozen=True)
-class Disturbance:
-    """A wrong state at the apex of the last flight."""
-
-    speed_factor: float = 1.0  # on the horizontal velocity of the whole robot [1]
-    pitch_rad: float = 0.0  # turn of the whole robot about its CoM, forward along ``direction_rad``
-    height_m: float = 0.0  # shift of the whole robot upward
-    # from the heading in which the jump shall land; a quarter turn tips it to its left
-    direction_rad: float = 0.0
+@runtime_checkable
+class Disturbance(Protocol):
+    """A dataclass that makes a wrong state at the apex of the last flight."""
 
     def apex(self, tape: Tape, robot: Robot) -> tuple[int, np.ndarray, np.ndarray]:
-        """Step of the apex of ``tape``, and the disturbed q (nq,), v (nv,) of ``robot`` there."""
-        gauge = Gauge(robot)
-        rows = tape.flights[-1]
-        for row in range(rows.start, rows.stop):
-            now = gauge.motion(tape.q[row], tape.v[row])
-            if now.velocity[2] <= 0:
-                break
-        v = tape.v[row].copy()
-        speed = now.velocity
-        seen = about_vertical(gauge.heading(tape.q[-1]) + self.direction_rad)
-        turn = seen @ pin.rpy.rpyToMatrix(0.0, self.pitch_rad, 0.0) @ seen.T
-        q = turned(tape.q[row], turn)
-        q[:3] = now.com + turn @ (q[:3] - now.com) + [0.0, 0.0, self.height_m]
-        # the base twist is written in base axes and so has turned with the robot; the flight of its
-        # CoM must not
-        v[:3] += rotation(q[3:7]).T @ (
-            speed * [self.speed_factor, self.speed_factor, 1.0] - turn @ speed
-        )
-        return round(float(tape.t[row]) / STEP_S), q, v
+        """Step of the apex of ``tape``, and q (nq,), v (nv,) of ``robot`` there."""
 
 
 @checked
@@ -213,8 +189,8 @@ def simulate_jump(
     perturbation : None simulates the robot as planned.
     scene : ground; flat if None.
     stand_s : how long to watch after the last touchdown [s]; less than the default is no landing.
-    disturbance : begin at the apex of the last flight, in a state that differs so; time, distance
-        and rise count from there.
+    disturbance : begin at the apex of the last flight, in a state that differs so, see
+        :class:`Disturbance`; time, distance and rise count from there.
     engine : "bullet" or "mujoco"; the default is the first that is installed.
     contact : "hard", as plans assume, or "usual", the engine's own defaults.
     control : ``mode``, ``reaim``, ``step``, ``feedback`` and ``landing`` of
@@ -242,11 +218,17 @@ def simulate_jump(
         return step >= watched or fallen_s > AFTER_FALL_S
 
     run.play(controller.drive, over, q, v, first)
-    settings = {name: control.get(name, False) for name in ("reaim", "step")}
-    settings |= dict(mode=controller.mode, stand_s=stand_s, **controller.to_json())
-    settings["disturbance"] = disturbance and asdict(disturbance)
-    flights = len(tape.flights) if disturbance is None else 1
-    result = run.result(controller.goal, controller.solves, flights=flights, **settings)
+    result = run.result(
+        controller.goal,
+        controller.solves,
+        flights=len(tape.flights) if disturbance is None else 1,
+        reaim=control.get("reaim", False),
+        step=control.get("step", False),
+        mode=controller.mode,
+        stand_s=stand_s,
+        disturbance=disturbance and asdict(disturbance),
+        **controller.to_json(),
+    )
     return replace(result, metrics=replace(result.metrics, recovery_step_s=controller.stepped_s))
 
 

@@ -16,7 +16,7 @@ import tomlkit
 
 from jumplab.arguments import checked, real
 from jumplab.control.estimator import SensorNoise
-from jumplab.control.kinematics import Gauge
+from jumplab.control.kinematics import Gauge, about_vertical
 from jumplab.errors import InputError, quoted
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -57,13 +57,8 @@ Pair = tuple[float, float]  # from ... to
 Vector = tuple[float, float, float]
 ByName = dict[str, float]  # of links or joints
 NONE = 0.0, 0.0
-FACTORS = {
-    "%": 100.0,
-    "%/kW": 100.0,
-    "mm": 1e3,
-    "mm per axis": 1e3,
-    "ms late": 1e3,
-}  # of what is said, by its unit
+# of what is said, by its unit
+FACTORS = {"%": 100.0, "%/kW": 100.0, "mm": 1e3, "mm per axis": 1e3, "ms late": 1e3}
 
 
 def _up_to(default: Any, most: float, words: str, unit: str = "", least: float = 0.0) -> Any:
@@ -118,8 +113,7 @@ class Ranges:
             if not good or len(numbers) != 1 + pair:
                 wanted = "two numbers, from and to" if pair else "one number, a half-width"
                 raise InputError(f"the range {f.name} must be {wanted}, got {quoted(value)}")
-            least = f.metadata["least"]
-            most = f.metadata["most"]
+            least, most = (f.metadata[key] for key in ("least", "most"))
             if not least <= numbers[0] <= numbers[-1] <= most:
                 given = " ... ".join(f"{x:g}" for x in numbers)
                 raise InputError(
@@ -157,9 +151,7 @@ class Ranges:
 
 
 # a "slight" difference: about a fifth of a workshop's uncertainty
-SLIGHT = Ranges(
-    0.01, 0.002, 0.02, friction=(FRICTION, FRICTION), delay_s=(0.0, 0.0), motor_gain=0.01
-)
+SLIGHT = Ranges.none(mass=0.01, com_m=0.002, inertia=0.02, motor_gain=0.01)
 
 
 @dataclass(frozen=True)
@@ -286,9 +278,9 @@ class Perturbation:
         limits and motors changed.
         """
         lost = {"effort": self.torque_loss, "speed": self.speed_loss}
-        heavier = {key: more for key in ("armature", "damping") if (more := getattr(self, key))}
-        same = not (self.mass or self.inertia or self.com or self.payload_kg)
-        if same and not any(lost.values()) and not heavier:
+        heavier = {"armature": self.armature, "damping": self.damping}
+        bodies = self.mass, self.inertia, self.com, self.payload_kg
+        if not any([*bodies, *lost.values(), *heavier.values()]):
             return robot
         left = {k: {name: 1 - x for name, x in losses.items()} for k, losses in lost.items()}
         root = ET.fromstring(limits(robot, left, {})[0])
@@ -304,14 +296,19 @@ class Perturbation:
             xyz = np.array(origin.get("xyz").split(), float) + self.com.get(name, (0.0, 0.0, 0.0))
             origin.set("xyz", " ".join(f"{x:.12g}" for x in xyz))
         if self.payload_kg:
-            values = dict(base=robot.model.frames[2].name, mass=f"{self.payload_kg:.12g}")
-            moment = f"{self.payload_kg * PAYLOAD_SIDE_M**2 / 6:.12g}"
-            place = " ".join(f"{x:.12g}" for x in self.payload_m)
-            root.extend(ET.fromstring(PAYLOAD.format(**values, moment=moment, place=place)))
+            payload = PAYLOAD.format(
+                base=robot.model.frames[2].name,
+                mass=f"{self.payload_kg:.12g}",
+                moment=f"{self.payload_kg * PAYLOAD_SIDE_M**2 / 6:.12g}",
+                place=" ".join(f"{x:.12g}" for x in self.payload_m),
+            )
+            root.extend(ET.fromstring(payload))
         config = tomlkit.parse(robot.config_text)
         for key, more in heavier.items():
             known = robot.motors[key]
-            config["actuators"][key] = {name: known.get(name, 0.0) + x for name, x in more.items()}
+            total = {name: known.get(name, 0.0) + x for name, x in more.items()}
+            if total:
+                config["actuators"][key] = total
         real = Robot(ET.tostring(root, encoding="unicode"), tomlkit.dumps(config))
         return real.under_gravity(robot.gravity)
 
@@ -337,7 +334,7 @@ class Perturbation:
         pushes = []
         for shove in self.shoves:
             begin, until = spans[shove.phase]
-            way = np.array([np.cos(shove.direction_rad), np.sin(shove.direction_rad), 0.0])
+            way = about_vertical(shove.direction_rad)[:, 0]
             force = tuple((shove.impulse_n_s / PUSH_S * way).tolist())
             at = round((begin + shove.share * (until - begin - PUSH_S)) / STEP_S)
             pushes.append(Push(at, round(PUSH_S / STEP_S), force))
@@ -397,10 +394,11 @@ def _trunk_box(robot: Robot, payload_kg: float) -> tuple[np.ndarray, np.ndarray]
     if not payload_kg:
         return np.zeros(3), np.zeros(3)
     model = robot.model
+    trunk = model.frames[2].name
     shapes = pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.COLLISION)
     corners = []
     for shape in shapes.geometryObjects:
-        if model.frames[shape.parentFrame].name == model.frames[2].name:
+        if model.frames[shape.parentFrame].name == trunk:
             shape.geometry.computeLocalAABB()
             box = shape.geometry.aabb_local
             ends = product(*np.transpose([box.min_, box.max_]))
@@ -429,13 +427,10 @@ def ranges_of(asked: Mapping[str, tuple[float, ...]], base: Ranges | None = None
         if not hasattr(nothing, name):
             known = ", ".join(f.name for f in fields(Ranges))
             raise InputError(f"no disturbance is called {quoted(name)}; there are {known}")
-        if is_pair(name):
-            low = getattr(nothing, name)[0]
-            changed[name] = tuple(sorted((low, *values)) if len(values) == 1 else values)
-        elif len(values) == 1:
-            changed[name] = values[0]
+        if len(values) > 1:
+            changed[name] = values
+        elif is_pair(name):
+            changed[name] = tuple(sorted((getattr(nothing, name)[0], *values)))
         else:
-            raise InputError(
-                f"the range {name} is a half-width: give it one number, got {len(values)}"
-            )
+            changed[name] = values[0]
     return replace(base or nothing, **changed)

@@ -167,6 +167,17 @@ class SimulationResult(Shown, Named):
         verdict = f"stands {m.standing_s:.2f} s{stepped}" if m.landed else f"FAILED, {m.reason}"
         return f"travel {far}, rise {high}, {verdict}"
 
+    @cached_property
+    def feet(self) -> np.ndarray:
+        """(N, 2, 4, 4) homogeneous transforms of both foot links [m]."""
+        gauge = Gauge(self.robot)
+        return np.array([[foot.homogeneous for foot in gauge.places(q)] for q in self.q])
+
+    @cached_property
+    def stray(self) -> np.ndarray:
+        """(N, links) whether a link touches the ground, but for the feet, which shall."""
+        return self.touching & ~np.isin(self.link_names, self.robot.foot.frames)
+
     @property
     def checks_passed(self) -> bool:
         """True if the run was checked, and every check passed."""
@@ -288,7 +299,7 @@ def record(
         phase[liftoff:touchdown] = "flight"
     if len(flown) == flights and flown[-1][1] is not None:
         phase[flown[-1][1] :] = "landing"
-    motions = [gauge.motion(*row) for row in zip(q, v, strict=True)]
+    _, com, velocity, momentum, inertia = zip(*map(gauge.motion, q, v), strict=True)
     log = dict(
         t=np.arange(len(q)) * STEP_S,
         q=q,
@@ -296,10 +307,10 @@ def record(
         tau=tau,
         foot_wrench=wrench,
         phase=phase,
-        com=np.array([motion.com for motion in motions]),
-        com_velocity=np.array([motion.velocity for motion in motions]),
-        L=np.array([motion.momentum[1] for motion in motions]),
-        rho=np.array([motion.inertia[1, 1] for motion in motions]),
+        com=np.array(com),
+        com_velocity=np.array(velocity),
+        L=np.array(momentum)[:, 1],
+        rho=np.array(inertia)[:, 1, 1],
         touching=np.array([[name in c.touching for name in links] for c in contacts]),
         colliding=np.array([c.colliding for c in contacts]),
     )
@@ -308,14 +319,12 @@ def record(
     names = dict(link_names=links, joint_names=robot.joint_names)
     run = SimulationResult(**log, **names, metrics=None, settings=settings or {}, robot=robot)
     jump = _Jump(run, gauge, goal, flown, flights)
-    standing_s, landed, reason = jump.verdict(higher_m)
+    verdict = zip(("standing_s", "landed", "reason"), jump.verdict(higher_m), strict=True)
     metrics = Metrics(
         **jump.loads(),
         **jump.launch(),
         **jump.landing(),
-        standing_s=standing_s,
-        landed=landed,
-        reason=reason,
+        **dict(verdict),
         self_collision_s=STEP_S * float(run.colliding.sum()),
         qp_solves=solves[0],
         qp_failures=solves[1],
@@ -350,24 +359,14 @@ class _Jump:
         height = self.run.com[slice(*rows), 2]
         return float(height.max() - height[0])
 
-    @cached_property
-    def force(self) -> np.ndarray:
-        """(N, 3) of the ground on both feet [N]."""
-        return self.run.foot_wrench[:, :, :3].sum(axis=1)
-
-    @cached_property
-    def stray(self) -> np.ndarray:
-        """(N, links), see :func:`stray`."""
-        return stray(self.run, self.run.robot)
-
     def launch(self) -> dict[str, Any]:
         """Up to the touchdown."""
         run = self.run
         off = self.liftoff
-        stray = self.stray[: self.touchdown].any(axis=0)
+        stray = run.stray[: self.touchdown].any(axis=0)
         out = dict(
             stray_contacts=tuple(run.link_names[i] for i in np.flatnonzero(stray)),
-            launch_impulse=_xz(self.force[:off].sum(axis=0) * STEP_S),
+            launch_impulse=_xz(run.foot_wrench[:off, :, :3].sum(axis=(0, 1)) * STEP_S),
             slip_m=self.slip(),
         )
         if off is None:
@@ -388,9 +387,9 @@ class _Jump:
         robot = self.run.robot
         rows = slice(0, self.touchdown)
         loaded = self.run.foot_wrench[rows, :, 2] > LOADED * robot.total_mass * robot.gravity
-        tips = [[x.act(robot.foot.tip) for x in self.gauge.places(q)] for q in self.run.q[rows]]
+        tips = (self.run.feet[rows] @ [*robot.foot.tip, 1.0])[..., :3]
         ways = [0.0]
-        for down, tip in zip(loaded.T, np.swapaxes(tips, 0, 1), strict=True):
+        for down, tip in zip(loaded.T, tips.swapaxes(0, 1), strict=True):
             edges = np.flatnonzero(np.diff(down.astype(int), prepend=0, append=0)).reshape(-1, 2)
             ways += [np.linalg.norm((tip[a:b] - tip[a])[:, :2], axis=1).max() for a, b in edges]
         return float(max(ways))
@@ -409,7 +408,7 @@ class _Jump:
         heights = [foot.act(self.run.robot.foot.center)[2] for foot in gauge.places(run.q[down])]
         both = abs(np.subtract(*heights)) < LEVEL_TOLERANCE_M
         seen = about_vertical(-heading)
-        impact = self.force[down:][: round(IMPACT_S / STEP_S)]
+        impact = run.foot_wrench[down:, :, :3].sum(axis=1)[: round(IMPACT_S / STEP_S)]
         window = round(SMOOTHING_S / STEP_S)
         means = np.convolve(impact[:, 2], np.full(window, 1 / window))[: len(impact)]
         yaw = gauge.heading(run.q[-1]) - gauge.heading(run.q[0])
@@ -432,46 +431,48 @@ class _Jump:
 
     def verdict(self, higher_m: float) -> tuple[float, bool, str]:
         """Seconds on the feet alone after touchdown, whether that is a landing, and why (not)."""
+        run = self.run
         down = self.touchdown
+        fallen = np.flatnonzero(run.stray.any(axis=1))
         if down is None:
-            return 0.0, False, self._unfinished()
-        fallen = np.flatnonzero(self.stray.any(axis=1))
-        end = next((int(row) for row in fallen if row >= down), len(self.stray))
-        standing = float((end - down) * STEP_S)
+            return 0.0, False, self._unfinished(fallen)
+        after = fallen[fallen >= down]
+        standing = float(([*after, len(run.t)][0] - down) * STEP_S)
         # a fall in the air is told only of a robot that did not stand
-        first = int(fallen[0]) if len(fallen) and standing < STAND_S else end
-        row = end if end < len(self.stray) else first
-        if row < len(self.stray):
-            side = "after" if row >= down else "before"
-            name = self.run.link_names[int(np.argmax(self.stray[row]))]
-            when = f"{abs(row - down) * STEP_S:.2f} s {side} touchdown"
-            return standing, False, f"{name} touched the ground {when}"
-        return standing, *self._stands(standing, higher_m)
+        falls = [*after, *(fallen if standing < STAND_S else ())]
+        speed = float(np.linalg.norm(run.com_velocity[-1]))
+        miss = (self.gauge.soles(run.q[-1]) - self.gauge.soles(self.goal))[2] - higher_m
+        if falls:
+            side = "after" if falls[0] >= down else "before"
+            when = f"{abs(falls[0] - down) * STEP_S:.2f} s {side} touchdown"
+            reason = f"{self._link(falls[0])} touched the ground {when}"
+        elif standing < STAND_S:
+            reason = f"watched for {standing:.2f} s only, not {STAND_S:g} s"
+        elif speed > STILL_SPEED:
+            reason = f"still moving at {speed:.2f} m/s at the end"
+        elif not (run.foot_wrench[-1, :, 2] > CONTACT_FORCE_N).all():
+            reason = "a foot was in the air at the end"
+        elif abs(miss) > LEVEL_TOLERANCE_M:
+            reason = f"stands {miss:+.2f} m from the height it was meant to land on"
+        else:
+            return standing, True, f"stood for {standing:.2f} s on its feet alone"
+        return standing, False, reason
 
-    def _unfinished(self) -> str:
-        """Why there is no last touchdown."""
+    def _link(self, row: int) -> str:
+        """The first link that lies on the ground in a row."""
+        return self.run.link_names[int(np.argmax(self.run.stray[row]))]
+
+    def _unfinished(self, fallen: np.ndarray) -> str:
+        """Why there is no last touchdown; the robot has ``fallen`` in these rows."""
         if not self.flown:
             return "the feet never left the ground"
         if self.flights == 1:
             return "the feet never touched down"
-        fallen = np.flatnonzero(self.stray.any(axis=1))
-        name = self.run.link_names[int(np.argmax(self.stray[fallen[0]]))] if len(fallen) else ""
-        fell = f", {name} touched the ground after {fallen[0] * STEP_S:.2f} s" if name else ""
+        fell = ""
+        if len(fallen):
+            when = f"{fallen[0] * STEP_S:.2f} s"
+            fell = f", {self._link(fallen[0])} touched the ground after {when}"
         return f"{len(self.flown)} of {self.flights} flights were begun{fell}"
-
-    def _stands(self, standing: float, higher_m: float) -> tuple[bool, str]:
-        run = self.run
-        if standing < STAND_S:
-            return False, f"watched for {standing:.2f} s only, not {STAND_S:g} s"
-        speed = float(np.linalg.norm(run.com_velocity[-1]))
-        if speed > STILL_SPEED:
-            return False, f"still moving at {speed:.2f} m/s at the end"
-        if not (run.foot_wrench[-1, :, 2] > CONTACT_FORCE_N).all():
-            return False, "a foot was in the air at the end"
-        miss = (self.gauge.soles(run.q[-1]) - self.gauge.soles(self.goal))[2] - higher_m
-        if abs(miss) > LEVEL_TOLERANCE_M:
-            return False, f"stands {miss:+.2f} m from the height it was meant to land on"
-        return True, f"stood for {standing:.2f} s on its feet alone"
 
     def loads(self) -> dict[str, Any]:
         """Torques and speeds as shares of their limits."""
@@ -484,8 +485,9 @@ class _Jump:
         def by_joint(values: np.ndarray) -> ByJoint:
             return dict(zip(run.joint_names, values.tolist(), strict=True))
 
+        spent = motors_spent(motors, run.tau, rates)
         out = dict(
-            saturated_s=by_joint(motors_spent(motors, run.tau, rates).sum(axis=0) * STEP_S),
+            saturated_s=by_joint(spent.sum(axis=0) * STEP_S),
             overspeed_s=by_joint((speed > 1).sum(axis=0) * STEP_S),
         )
         for name, ratio in (("max_torque_ratio", torque), ("max_speed_ratio", speed)):
@@ -493,11 +495,6 @@ class _Jump:
             out[f"{name}_before_touchdown"] = float(ratio[: self.touchdown].max())
             out[f"{name}_by_joint"] = by_joint(ratio.max(axis=0))
         return out
-
-
-def stray(result: SimulationResult, robot: Robot) -> np.ndarray:
-    """Where links touch the ground (N, links), but for the feet, which shall."""
-    return result.touching & ~np.isin(result.link_names, robot.foot.frames)
 
 
 def motors_spent(motors: MotorLimits, tau: np.ndarray, rates: np.ndarray) -> np.ndarray:

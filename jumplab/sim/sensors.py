@@ -23,7 +23,7 @@ class Sensors:
 
     def __init__(self, noise: SensorNoise, seed: int, gravity: float = GRAVITY):
         # a stream of its own beside the robot's draw
-        self.noise = noise
+        self._noise = noise
         self._rng = np.random.default_rng([seed, 1])
         self._other = np.random.default_rng([seed, 3])
         self._gyro_bias = noise.gyro_bias * self._rng.standard_normal(3)
@@ -33,14 +33,14 @@ class Sensors:
 
     def initial(self, q: np.ndarray) -> np.ndarray:
         """Configuration (nq,) as it is believed to be before the jump: a little tilted."""
-        error = self.noise.tilt_rad * self._rng.standard_normal(2)
+        error = self._noise.tilt_rad * self._rng.standard_normal(2)
         return turned(q, pin.exp3(np.array([*error, 0.0])))
 
     def read(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Reading:
         """Measure the true state (q, v) and the true wrenches (2, 6) under the feet; call it once
         per step.
         """
-        n = self.noise
+        n = self._noise
         draw = self._rng.standard_normal
         attitude = rotation(q[3:7])
         velocity = attitude @ v[:3]
@@ -55,14 +55,14 @@ class Sensors:
             v[6:] + n.joint_rate * draw(len(v) - 6),
             v[3:6] + self._gyro_bias + n.gyro * draw(3),
             force + self._accel_bias + n.accel * draw(3),
-            self._felt(wrench, draw(2)),
+            wrench + n.force * self._wrench_error(),
         )
 
-    def _felt(self, wrench: np.ndarray, vertical: np.ndarray) -> np.ndarray:
-        """Foot wrenches (2, 6) as measured; ``vertical`` (2,) is drawn for the forces up."""
+    def _wrench_error(self) -> np.ndarray:
+        """Errors (2, 6) of the foot wrenches, in standard deviations of a force."""
         error = self._other.standard_normal((2, 6)) * np.repeat([1.0, LEVER_M], 3)
-        error[:, 2] = vertical
-        return wrench + self.noise.force * error
+        error[:, 2] = self._rng.standard_normal(2)
+        return error
 
 
 class Perception:
@@ -72,8 +72,7 @@ class Perception:
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise, seed: int):
         self._sensors = Sensors(noise, seed, robot.gravity)
-        self._tilt = 0.0
-        self._speed = 0.0
+        self._worst = np.zeros(2)  # errors of tilt [rad] and velocity [m/s]
         exact = noise == SensorNoise()  # then the true state stands for its estimate
         self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
 
@@ -83,18 +82,18 @@ class Perception:
             return state
         reading = self._sensors.read(*state)
         q, v = self._estimator.update(reading)
-        errors = estimation_error(*state[:2], q, v)
-        self._tilt, self._speed = np.maximum((self._tilt, self._speed), errors).tolist()
+        self._worst = np.maximum(self._worst, estimation_error(*state[:2], q, v))
         return State(q, v, reading.foot_wrench)
 
     def to_json(self) -> dict:
         """What the settings of a result say."""
         if self._estimator is None:
             return {"state": "true"}
+        tilt, speed = self._worst.tolist()
         return {
             "state": "estimated",
-            "worst_tilt_error_rad": self._tilt,
-            "worst_velocity_error": self._speed,
+            "worst_tilt_error_rad": tilt,
+            "worst_velocity_error": speed,
         }
 
 

@@ -10,9 +10,14 @@ from pathlib import Path
 
 import joblib
 import numpy as np
+import pinocchio as pin
 
+from jumplab.control import STEP_S
+from jumplab.control.kinematics import Gauge, about_vertical, rotation, turned
 from jumplab.errors import InputError
-from jumplab.sim import Disturbance, Perturbation, Ranges
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.sim import Perturbation, Ranges
 from jumplab.studies.study import Plain, check_numbers, short_hash
 from jumplab.studies.trials import (
     PlanOnFile,
@@ -24,6 +29,37 @@ from jumplab.studies.trials import (
 )
 
 SHUFFLE_SEED = 0  # of the grid's order, so that any first part of it is a fair sample
+
+
+@dataclass(frozen=True)
+class WrongApex:
+    """A wrong state at the apex of the last flight."""
+
+    speed_factor: float = 1.0  # on the horizontal velocity of the whole robot [1]
+    pitch_rad: float = 0.0  # turn of the whole robot about its CoM, forward along ``direction_rad``
+    height_m: float = 0.0  # shift of the whole robot upward
+    # from the heading in which the jump shall land; a quarter turn tips it to its left
+    direction_rad: float = 0.0
+
+    def apex(self, tape: Tape, robot: Robot) -> tuple[int, np.ndarray, np.ndarray]:
+        """Step of the apex of ``tape``, and the disturbed q (nq,), v (nv,) of ``robot`` there."""
+        gauge = Gauge(robot)
+        rows = range(len(tape.t))[tape.flights[-1]]
+        sinking = (k for k in rows if gauge.motion(tape.q[k], tape.v[k]).velocity[2] <= 0)
+        row = next(sinking, rows[-1])
+        now = gauge.motion(tape.q[row], tape.v[row])
+        v = tape.v[row].copy()
+        speed = now.velocity
+        seen = about_vertical(gauge.heading(tape.q[-1]) + self.direction_rad)
+        turn = seen @ pin.rpy.rpyToMatrix(0.0, self.pitch_rad, 0.0) @ seen.T
+        q = turned(tape.q[row], turn)
+        q[:3] = now.com + turn @ (q[:3] - now.com) + [0.0, 0.0, self.height_m]
+        # the base twist is written in base axes and so has turned with the robot; the flight of its
+        # CoM must not
+        v[:3] += rotation(q[3:7]).T @ (
+            speed * [self.speed_factor, self.speed_factor, 1.0] - turn @ speed
+        )
+        return round(float(tape.t[row]) / STEP_S), q, v
 
 
 @dataclass(frozen=True)
@@ -118,7 +154,7 @@ def landing_basin(
 
 def drop(plan: PlanOnFile, settings: TrialSettings, key: TrialKey, state: BasinState) -> Trial:
     """Simulate one ``state`` (speeds [1], pitch [degrees], height [m]) from the apex on."""
-    wrong = Disturbance(state.speed_factor, float(np.radians(state.pitch_deg)), state.height_m)
+    wrong = WrongApex(state.speed_factor, float(np.radians(state.pitch_deg)), state.height_m)
     floor = Perturbation(key.robot_seed, friction=state.friction, noise=settings.noise)
     trial = run_trial(plan, settings, key, floor, wrong)
     return replace(trial, features=asdict(state))
