@@ -66,7 +66,7 @@ def test_multipliers_of_two_meshes_say_the_same():
         wall = Term("wall", "-", "m/s", "node", lambda p: p.v, lower=-np.inf, upper=1.7)
         problem = move(wall)
         nlp = Nlp(replace(problem, phases=(replace(problem.phases[0], intervals=n),)))
-        guess = {"go": flat_guess()["go"].resampled(n)}
+        guess = {"go": PhaseGuess(1.0, np.zeros((n + 1, 1)))}
         found[n] = nlp.solve({"goal": 1.0}, guess), nlp
     share, values = found[60][0].multipliers.rows["go", "wall"]
     coarse = pack_multipliers(found[60][1].assembled, found[30][0].multipliers)[1]

@@ -105,8 +105,11 @@ class SpatialModel:
                     _clean(second),
                 )
             )
+        self.mass = float(sum(b.mass for b in self.bodies))
+        self.carried = [b.mass for b in self.bodies]
+        for k in range(len(self.bodies) - 1, 0, -1):
+            self.carried[self.bodies[k].parent] += self.carried[k]
         pin.centerOfMass(model, data, pin.neutral(model))
-        self.mass, *self.carried = data.mass
         middles = zip(data.oMi[1:], data.com[1:], strict=True)
         self._aside_m = [place.act(com)[1] for place, com in middles]  # of all that a joint carries
         self.joints = len(self.bodies) - 1

@@ -56,13 +56,9 @@ def pose(
     Raises :class:`InputError` for whatever does not fit.
     """
     weights = weights or {}
-    a.problem.check_names([*weights, *off], "weight or switch")
+    a.problem.check_names(off, "weight or switch")
     for name in weights:
-        if not any(is_named(owner, t, (name,)) for owner, t in a.cost_terms):
-            raise InputError(
-                f"{a.problem.name}: {name!r} is a constraint and has no weight; switch it off "
-                "instead"
-            )
+        a.problem.costs(name)
     p = _data(a, parameters, references or {}, weights, off)
     box = variable_bounds(a, parameters, off)
     return Posed(np.clip(pack(a, guess), *box), p, box, row_bounds(a, parameters, off))

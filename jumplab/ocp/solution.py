@@ -5,9 +5,10 @@ multipliers, statistics.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 
 from jumplab.errors import Shown
 from jumplab.ocp.problem import Problem
@@ -33,13 +34,11 @@ def quintic(
     missing = q1 - q0 - step * v0 - step**2 * a0 / 2
     rate = step * (v1 - v0) - step**2 * a0
     bend = step**2 * (a1 - a0)
-    c3 = 10 * missing - 4 * rate + bend / 2
-    c4 = -15 * missing + 7 * rate - bend
-    c5 = 6 * missing - 3 * rate + bend / 2
-    q = q0 + h * v0 + h**2 * a0 / 2 + u**3 * (c3 + u * (c4 + u * c5))
-    v = v0 + h * a0 + u**2 * (3 * c3 + u * (4 * c4 + u * 5 * c5)) / step
-    a = a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5)) / step**2
-    return q, v, a
+    cubic = 10 * missing - 4 * rate + bend / 2
+    quartic = -15 * missing + 7 * rate - bend
+    last = 6 * missing - 3 * rate + bend / 2
+    c = np.array([q0, step * v0, step**2 * a0 / 2, cubic, quartic, last])
+    return tuple(polyval(u, polyder(c, k), tensor=False) / step**k for k in range(3))
 
 
 @dataclass(frozen=True, repr=False)
@@ -52,13 +51,6 @@ class PhaseGuess(Shown):
     a: np.ndarray | None = None
     z: np.ndarray | None = None
     constants: dict = field(default_factory=dict)
-
-    def resampled(self, intervals: int) -> PhaseGuess:
-        """The same guess at (intervals + 1) nodes, by straight lines between its own."""
-        old = np.linspace(0, 1, len(self.q))
-        new = np.linspace(0, 1, intervals + 1)
-        values = {key: x for key in "qvaz" if (x := getattr(self, key)) is not None}
-        return replace(self, **{key: resampled(old, x, new) for key, x in values.items()})
 
 
 @dataclass(frozen=True, repr=False)
