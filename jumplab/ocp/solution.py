@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.polynomial.polynomial import polyder, polyval
 
 from jumplab.errors import Shown
 from jumplab.ocp.problem import Problem
@@ -34,11 +33,13 @@ def quintic(
     missing = q1 - q0 - step * v0 - step**2 * a0 / 2
     rate = step * (v1 - v0) - step**2 * a0
     bend = step**2 * (a1 - a0)
-    cubic = 10 * missing - 4 * rate + bend / 2
-    quartic = -15 * missing + 7 * rate - bend
-    last = 6 * missing - 3 * rate + bend / 2
-    c = np.array([q0, step * v0, step**2 * a0 / 2, cubic, quartic, last])
-    return tuple(polyval(u, polyder(c, k), tensor=False) / step**k for k in range(3))
+    c3 = 10 * missing - 4 * rate + bend / 2
+    c4 = -15 * missing + 7 * rate - bend
+    c5 = 6 * missing - 3 * rate + bend / 2
+    q = q0 + h * v0 + h**2 * a0 / 2 + u**3 * (c3 + u * (c4 + u * c5))
+    v = v0 + h * a0 + u**2 * (3 * c3 + u * (4 * c4 + u * 5 * c5)) / step
+    a = a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5)) / step**2
+    return q, v, a
 
 
 @dataclass(frozen=True, repr=False)
