@@ -197,8 +197,10 @@ class JointMapper:
         spent = answer.iterations, solve_s, residual
         return Step(state.q, state.v, a, predicted, f.reshape(2, 6), tau, *spent)
 
-    def roll(self, qp: PhaseQp, solver: Any, state: State) -> tuple[list[Step], State]:
-        """All steps of one phase from the state at its start, and the state at its end."""
+    def roll(self, qp: PhaseQp, solver: Any, state: State) -> list[Step]:
+        """All steps of one phase from the state at its start, and a last one that stands at its
+        end.
+        """
         steps = []
         before = state.a
         for k, h in enumerate(qp.steps):
@@ -207,7 +209,7 @@ class JointMapper:
             q = pin.integrate(self.body.model, step.q, step.v * h + step.a * (h * h / 2))
             state = State(q, step.v + step.a * h, step.a)
             steps.append(step)
-        return steps, state
+        return [*steps, step._replace(q=state.q, v=state.v, iterations=0, solve_s=0.0)]
 
     def run(self, solver: Any = None) -> JointPlan:
         """Roll out launch and flight.
@@ -218,31 +220,27 @@ class JointMapper:
         """
         began = time.perf_counter()
         rest = np.zeros(self.body.nv)
-        launch, takeoff = self.roll(self.launch, solver or QpSolver(), State(self.q0, rest, rest))
-        flight, end = self.roll(self.flight_from(takeoff), solver or QpSolver(), takeoff)
-        rows = [
-            *launch,
-            launch[-1]._replace(q=takeoff.q, v=takeoff.v),
-            *flight,
-            flight[-1]._replace(q=end.q, v=end.v),
-        ]
-        on_toes = sum(self.launch.on_toes)
-        times = [len(launch) - on_toes, on_toes + 1, len(flight) + 1]
+        solver = solver or QpSolver()
+        launch = self.roll(self.launch, solver, State(self.q0, rest, rest))
+        takeoff = State(*launch[-1][:3])
+        flight = self.roll(self.flight_from(takeoff), solver, takeoff)
+        rows = Step(*zip(*launch, *flight, strict=True))
+        toes = sum(self.launch.on_toes) + 1
+        times = [len(launch) - toes, toes, len(flight)]
         columns = {
             "t": np.append(self.launch.t, self.launch.t[-1] + self.reference.flight.t),
             "phase": np.repeat(["launch", "launch", "flight"], times),
             "contact": np.repeat(["flat", "toe", "air"], times),
-            **{name: np.array([getattr(row, name) for row in rows]) for name in AT_NODES},
+            **{name: np.array(getattr(rows, name)) for name in AT_NODES},
         }
         for x in columns.values():
             x.setflags(write=False)
-        steps = Step(*zip(*launch, *flight, strict=True))
         statistics = Statistics(
-            len(steps.q),
-            sum(steps.iterations),
-            sum(steps.solve_s),
+            len(rows.q) - 2,
+            sum(rows.iterations),
+            sum(rows.solve_s),
             time.perf_counter() - began,
-            max(steps.residual),
+            max(rows.residual),
         )
         made = dict(statistics=statistics, options=self.options, problem=self.problem)
         return JointPlan(**columns, **made)
