@@ -201,7 +201,6 @@ class Nlp:
             rows=len(g),
             objective=float(answer["f"]),
             residual=residual,
-            functions_s=sum(s for key, s in stats.items() if key.startswith("t_proc_nlp_")),
         )
         return Solution(
             unpack(a, x),

@@ -100,9 +100,7 @@ class Multipliers(Shown):
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a solve cost; ``functions_s`` is the CPU time of function evaluations, the rest is the
-    solver's own.
-    """
+    """What a solve cost."""
 
     iterations: int
     status: str
@@ -112,7 +110,6 @@ class Statistics:
     rows: int
     objective: float
     residual: float
-    functions_s: float = 0.0
 
 
 @dataclass(frozen=True, repr=False)
