@@ -12,7 +12,7 @@ from jumplab.auditing.audit import audit
 from jumplab.errors import InputError
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import GOOD_STATUSES, WARM, Nlp, PhaseGuess
-from jumplab.ocp.posing import pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
+from jumplab.ocp.posing import pack, pack_multipliers, unpack, unpack_multipliers
 from jumplab.ocp.problem import Term
 from jumplab.stages import planner as pipeline
 from jumplab.task import JumpTask
@@ -37,13 +37,6 @@ def test_every_row_has_one_place(assembled):
     found = np.concatenate([rows.index.ravel() for rows in assembled.rows])
     np.testing.assert_array_equal(np.sort(found), np.arange(assembled.n_rows))
     assert all(len(rows.nodes) == len(rows.index) for rows in assembled.rows)
-
-
-def test_rows_that_are_off_have_no_bounds(assembled):
-    low, high = row_bounds(assembled, {}, ("one/mid row", "meet"))
-    for rows in assembled.rows:
-        least, most = (-np.inf, np.inf) if rows.term.name in ("mid row", "meet") else (0.0, 0.0)
-        assert np.all(low[rows.index] == least) and np.all(high[rows.index] == most)
 
 
 def test_multipliers_survive_on_their_own_mesh(assembled):
