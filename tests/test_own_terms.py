@@ -22,7 +22,6 @@ from jumplab.ocp import Nlp, Problem, Term, changed
 from jumplab.ocp import cache as kept
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.problem import Point
-from jumplab.robot.stance import stance_configuration
 from jumplab.stages.changes import settled, sorted_out
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.srmp import build_problem as srmp_problem
@@ -32,8 +31,7 @@ from jumplab.stages.whole_body.contacts import jump_contacts
 from jumplab.stages.whole_body.coordinates import even
 from jumplab.stages.whole_body.instant import Instant
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.studies.chain import Course, crouched, rehearse, run_chain, run_chains
-from jumplab.studies.chain.foresight import Foresight
+from jumplab.studies.chain import Course, crouched, run_chain, run_chains
 
 SMALL = Mesh(6, 4, 6)
 STAGES = (
@@ -360,11 +358,6 @@ def armed(weight: float, **how) -> jl.Planner:
     return jl.Planner(jl.Robot.load(), terms={"whole body/flight": [calm(weight)]}, **how)
 
 
-@cache
-def plain(mesh: Mesh | None) -> jl.Planner:
-    return jl.Planner(jl.Robot.load(), mesh=mesh)
-
-
 def falls(values: list[float]) -> bool:
     return all(b <= a * (1 + SLACK) for a, b in pairwise(values)) and values[-1] < values[0]
 
@@ -448,9 +441,8 @@ def test_cached_and_uncached_processes_plan_the_same(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("target", TARGETS)
-def test_a_growing_weight_calms_the_arms_in_every_path(target):
-    task, near = jl.JumpTask(*target), jl.JumpTask(target[0] + 0.02, target[1])
+def test_a_growing_weight_calms_the_arms_in_every_path():
+    task, near = jl.JumpTask(0.6, 0.4), jl.JumpTask(0.62, 0.4)
     plans = {w: armed(w).plan(task) for w in GROWING}
     assert falls([swing(plans[w].whole_body) for w in GROWING])
     again = {w: armed(w).replan(plans[w], near) for w in GROWING}
@@ -467,32 +459,6 @@ def test_a_growing_weight_straightens_stage_one(target):
     assert falls([turning(stage.plan(jl.JumpTask(*target)).solution.phases) for stage in how])
 
 
-FINE = Mesh(72, 32, 30)  # limits hold between its nodes, too, however heavy the arms are
-GENTLY = (0.01, 0.1, 1.0, 3.0)
-# targets, each with one of the methods; of the first one that mesh has no plan by three steps
-FLIPS = [("three-step", 0.0, 0.5, -1, None), ("direct", 0.2, 0.5, -1, FINE), ("direct", 0.0, 0.5, -1, FINE)]
-FLIPS += [("three-step", 0.0, 0.5, 1, FINE), ("three-step", 0.2, 0.5, 1, FINE), ("direct", 0.2, 0.4, 1, FINE)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("method", "distance_m", "height_m", "turns", "mesh"), FLIPS)
-def test_a_growing_weight_calms_the_arms_of_flips(method, distance_m, height_m, turns, mesh):
-    """A flip has several local solutions; where each weight begins with the plan of the one before, it stays the same.
-
-    The first one begins with the plan without the term.
-    """
-    task = jl.JumpTask(distance_m, height_m, rotation_rad=2 * np.pi * turns)
-    usual = plain(mesh).plan(task, method)
-    one = armed(0.1, mesh=mesh)
-    stage = one.stage("direct" if method == "direct" else "whole body", flip=True)
-    bodies = [usual.whole_body]
-    for w in GENTLY:
-        more = {"near": bodies[-1], "weights": {"flight/calm arms": w}}
-        bodies.append(stage.plan(task, usual.srmp, **more))
-        assert bodies[-1].start == "neighbour"
-    assert falls([swing(body) for body in bodies])
-
-
 @pytest.mark.slow
 def test_weights_of_a_flip():
     """Those of one plan are those of a planner, and a weight of zero changes nothing."""
@@ -501,26 +467,6 @@ def test_weights_of_a_flip():
     same(armed(0.0).plan(task, "direct"), usual)
     same(armed(0.1).plan(task, "direct", weights={"calm arms": 0}), usual)
     same(armed(0.1).plan(task, "direct", weights={"calm arms": 0.2}), armed(0.2).plan(task, "direct"))
-
-
-@cache
-def waiting(weight: float) -> jl.Planner:
-    return jl.Planner(crouched(jl.Robot.load()), terms={"whole body/flight": [calm(weight)]})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("target", TARGETS)
-def test_a_growing_weight_calms_the_arms_of_chains(target):
-    """A chain's first jump: as it is rehearsed, and as it is planned then from a measured posture."""
-    course, found = Course.of([target[0]], target[1]), []
-    for one in map(waiting, GROWING):
-        rehearsal, q = rehearse(course, one), stance_configuration(one.robot)
-        foresight = Foresight(course, one.robot, one, rehearsal, 0.3)
-        q[7:] += 0.03
-        foresight.learn_posture(q)
-        plans = rehearsal[0], foresight.look(0, 0.5, np.zeros(3)).plan
-        found.append([swing(plan.whole_body) for plan in plans])
-    assert all(falls(values) for values in zip(*found, strict=True)), found
 
 
 @pytest.mark.slow

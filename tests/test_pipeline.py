@@ -13,9 +13,6 @@ from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import GOOD_STATUSES
 from jumplab.robot import Robot
 from jumplab.stages import planner as pipeline
-from jumplab.stages.joint_qp import Limits as JointLimits
-from jumplab.stages.joint_qp import Options, rollout
-from jumplab.stages.joint_qp.settings import GENTLE
 from jumplab.stages.planner import METHODS, Planner, motion_of_joints
 from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.srmp.settings import SrmpSettings
@@ -40,17 +37,6 @@ def test_three_steps_and_one(plan):
     assert plan.srmp is not None and plan.joints is not None
     assert direct.srmp is None and direct.joints is None
     assert all(row.iterations > 0 and row.build_s >= 0 and row.solve_s > 0 for row in plan.statistics)
-
-
-def test_a_stage_two_that_follows_gently_says_so(monkeypatch, plan):
-    """Usual weights without the torques for it, and a fallback with them: the plan tells which it was, and why."""
-    weak = Options(limits=JointLimits(torque_share=0.2))
-    monkeypatch.setattr(rollout, "Options", lambda: weak)
-    gentle = planner().plan(JumpTask(0.5, 0.3), "three-step")
-    assert gentle.statistics[1].stage == "2 joint map, gentle" and gentle.joints.options == GENTLE
-    reason = gentle.summary["manifest"]["solvers"]["joint map"]["gentle"]
-    assert reason == gentle.joints.gentle and reason.startswith("stage 2: at t = ")
-    assert plan.joints.gentle == "" and "gentle" not in plan.summary["manifest"]["solvers"]["joint map"]
 
 
 def test_planned_numbers_are_the_tapes(plan):

@@ -12,7 +12,7 @@ from jumplab.auditing.audit import audit
 from jumplab.errors import InputError
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import GOOD_STATUSES, WARM, Nlp, PhaseGuess
-from jumplab.ocp.posing import pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
+from jumplab.ocp.posing import pack, pack_multipliers, unpack, unpack_multipliers
 from jumplab.ocp.problem import Term
 from jumplab.stages import planner as pipeline
 from jumplab.task import JumpTask
@@ -39,13 +39,6 @@ def test_every_row_has_one_place(assembled):
     assert all(len(rows.nodes) == len(rows.index) for rows in assembled.rows)
 
 
-def test_rows_that_are_off_have_no_bounds(assembled):
-    low, high = row_bounds(assembled, {}, ("one/mid row", "meet"))
-    for rows in assembled.rows:
-        least, most = (-np.inf, np.inf) if rows.term.name in ("mid row", "meet") else (0.0, 0.0)
-        assert np.all(low[rows.index] == least) and np.all(high[rows.index] == most)
-
-
 def test_multipliers_survive_on_their_own_mesh(assembled):
     rng = np.random.default_rng(1)
     lam_x, lam_g = rng.normal(size=assembled.size), rng.normal(size=assembled.n_rows)
@@ -66,7 +59,7 @@ def test_multipliers_of_two_meshes_say_the_same():
         wall = Term("wall", "-", "m/s", "node", lambda p: p.v, lower=-np.inf, upper=1.7)
         problem = move(wall)
         nlp = Nlp(replace(problem, phases=(replace(problem.phases[0], intervals=n),)))
-        guess = {"go": flat_guess()["go"].resampled(n)}
+        guess = {"go": PhaseGuess(1.0, np.zeros((n + 1, 1)))}
         found[n] = nlp.solve({"goal": 1.0}, guess), nlp
     share, values = found[60][0].multipliers.rows["go", "wall"]
     coarse = pack_multipliers(found[60][1].assembled, found[30][0].multipliers)[1]

@@ -18,7 +18,7 @@ from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.stages import srmp
 from jumplab.stages.joint_qp import build_problem
-from jumplab.stages.joint_qp.settings import GENTLE, Options
+from jumplab.stages.joint_qp.settings import Options
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.whole_body import Contacts, Limits, Mesh, Weights, coordinates
 from jumplab.stages.whole_body.body import Body
@@ -97,10 +97,9 @@ def table() -> str:
         if name == "spatial":
             found += lines(program(body, name, Contacts.hop(robot)), given)
     found += [f"of a flip: {line}" for line in flips if line not in found]
-    for name, options in (("joint qp", Options()), ("joint qp, gentle", GENTLE)):
-        for part, fields in asdict(options).items():
-            rows = fields.items() if isinstance(fields, dict) else [("", fields)]
-            found += [f"{name}/{part} | {key} | {value}" for key, value in rows]
+    for part, fields in asdict(Options()).items():
+        rows = fields.items() if isinstance(fields, dict) else [("", fields)]
+        found += [f"joint qp/{part} | {key} | {value}" for key, value in rows]
     for row in build_problem(Options()).table():
         head = " | ".join(row[key] for key in ("name", "equation", "kind", "value", "unit"))
         found.append(f"joint qp/{row['phase']} | {head}")

@@ -89,7 +89,7 @@ def test_a_turn_is_planned_by_the_spatial_program_alone():
         "direct, ramp, held Gauss-Newton",
     ]
     assert len(plan.statistics) == len(plan.whole_body.attempts)
-    assert plan.srmp is None and plan.joints is None and plan.skipped is None
+    assert plan.srmp is None and plan.joints is None
     assert set(plan.weights) == {"whole body"} and len(plan.terms()) > 30
     assert jl.audit(plan).passed
 

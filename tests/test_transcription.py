@@ -265,14 +265,6 @@ def test_places_are_checked():
     assert str(e.value) == ("term 'lost': at = 'nowhere', must be one of node, mid, interval, start, end, problem")
 
 
-def test_names_are_checked():
-    problem = toy()
-    problem.check_names(["mid row", "one/mid row", "rest", "toy/meet"], "switch")
-    with pytest.raises(InputError) as e:
-        problem.check_names(["mid rwo"], "switch")
-    assert str(e.value).startswith("switch 'mid rwo': the problem 'toy' has no such term; it has mid row, ")
-
-
 def test_table_lists_every_term_and_bound():
     problem = toy()
     rows = {(r["phase"], r["name"]): r for r in problem.table()}

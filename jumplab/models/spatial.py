@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -24,7 +24,10 @@ from jumplab.task import GRAVITY
 
 CHART = ("x", "y", "z", "yaw", "roll", "pitch")  # coordinates of the base
 ATTITUDE_AXES = (2, 0, 1)  # that yaw, roll and pitch turn about
+cross = ca.cross  # vector product (3,)
 ROUNDING = 1e-12  # entries of rotations and inertias below it are none
+# factors of an inertia, with which it is that of a body and its mirror image in the x-z plane
+WITH_MIRROR_IMAGE = np.array([[2, 0, 2], [0, 2, 0], [2, 0, 2]])
 ALONG = 1 - 1e-12  # cosine from which an axis is a coordinate axis
 
 
@@ -106,6 +109,9 @@ class SpatialModel:
         self.carried = [b.mass for b in self.bodies]
         for k in range(len(self.bodies) - 1, 0, -1):
             self.carried[self.bodies[k].parent] += self.carried[k]
+        pin.centerOfMass(model, data, pin.neutral(model))
+        middles = zip(data.oMi[1:], data.com[1:], strict=True)
+        self._aside_m = [place.act(com)[1] for place, com in middles]  # of all that a joint carries
         self.joints = len(self.bodies) - 1
         self.armature = np.array(model.armature[6:])
         self.names = (*CHART, *(b.name for b in self.bodies[1:]))
@@ -153,13 +159,8 @@ class SpatialModel:
         """Bodies in the middle and to the left of it; bodies that begin in the middle go with what
         they carry.
         """
-        data = self.model.createData()
-        pin.centerOfMass(self.model, data, pin.neutral(self.model), True)
-        carried = [place.act(com) for place, com in zip(data.oMi[1:], data.com[1:], strict=True)]
-        bodies = zip(self.across, carried, strict=True)
-        return tuple(
-            k for k, (across, com) in enumerate(bodies) if across is not None or com[1] > 0
-        )
+        bodies = enumerate(zip(self.across, self._aside_m, strict=True))
+        return tuple(k for k, (across, aside) in bodies if across is not None or aside > 0)
 
     def local(self, joint: int, point: np.ndarray) -> np.ndarray:
         """A ``point`` (3,) in Pinocchio's frame of a ``joint`` (its index there), in the frame of
@@ -171,8 +172,8 @@ class SpatialModel:
         """Of charts (n, >= 6), the base's attitudes (n, 3, 3), and the slopes (n, 3, 3) of its
         angular velocity, in its own axes, along the rates of yaw, roll and pitch.
         """
-        told = _base_functions()[2](q[:, :6].T)
-        return tuple(x.full().reshape(3, len(q), 3).transpose(1, 0, 2) for x in told)
+        angles = q[:, 3:6]
+        return _rotation().from_euler("ZXY", angles).as_matrix(), _slopes(angles)
 
     def to_pinocchio(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray
@@ -180,12 +181,16 @@ class SpatialModel:
         """Configurations (n, nq), twists and their time derivatives from charts, rates,
         accelerations, all (n, nv).
         """
-        base = (x[:, :6].T for x in (q, v, a))
-        twist, rate = (x.full().T for x in _base_functions()[0](*base))
-        # quaternions that follow whole turns
-        quaternions = _rotation().from_euler("ZXY", q[:, 3:6]).as_quat()
-        configurations = np.hstack([q[:, :3], quaternions, q[:, 6:]])
-        return configurations, np.hstack([twist, v[:, 6:]]), np.hstack([rate, a[:, 6:]])
+        angles, rates, gains = (x[:, 3:6] for x in (q, v, a))
+        turn = _rotation().from_euler("ZXY", angles)  # its quaternions follow whole turns
+        slope, change = _slopes(angles), _slopes(angles, rates)
+        speed = turn.apply(v[:, :3], inverse=True)
+        spin = _times(slope, rates)
+        accel = turn.apply(a[:, :3], inverse=True) - np.cross(spin, speed)
+        turning = _times(slope, gains) + _times(change, rates)
+        configurations = np.hstack([q[:, :3], turn.as_quat(), q[:, 6:]])
+        twists = np.hstack([speed, spin, v[:, 6:]])
+        return configurations, twists, np.hstack([accel, turning, a[:, 6:]])
 
     def charts(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: np.ndarray | None = None
@@ -194,9 +199,14 @@ class SpatialModel:
         inverse of :meth:`to_pinocchio`. The first attitude is within half a turn of the angles
         ``near`` (3,)."""
         chart = self.of_pinocchio(q, near)
-        base = (x[:, :6].T for x in (chart, v, a))
-        rates, gains = (x.full().T for x in _base_functions()[1](*base))
-        return chart, np.hstack([rates, v[:, 6:]]), np.hstack([gains, a[:, 6:]])
+        turn = _rotation().from_quat(q[:, 3:7])
+        speed, spin = v[:, :3], v[:, 3:6]
+        back = np.linalg.inv(_slopes(chart[:, 3:6]))
+        rates = _times(back, spin)
+        gains = _times(back, a[:, 3:6] - _times(_slopes(chart[:, 3:6], rates), rates))
+        accel = turn.apply(a[:, :3] + np.cross(spin, speed))
+        rates = np.hstack([turn.apply(speed), rates, v[:, 6:]])
+        return chart, rates, np.hstack([accel, gains, a[:, 6:]])
 
     def of_pinocchio(self, q: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Charts (n, 6 + joints) of configurations (n, nq), their angles continuous.
@@ -216,27 +226,23 @@ def _rotation() -> type:
     return Rotation
 
 
-@cache
-def _base_functions() -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Of a base, (chart, rates, accelerations) (6,) each -> (twist, its derivative) (6,) in
-    Pinocchio's words; (chart, twist, its derivative) -> (rates, accelerations); and what
-    :meth:`SpatialModel.attitudes` tells.
+def _slopes(angles: np.ndarray, rates: np.ndarray | None = None) -> np.ndarray:
+    """Slopes (n, 3, 3) of the base's angular velocity, in its own axes, along the rates of yaw,
+    roll and pitch (n, 3); with ``rates`` of these angles, their time derivative.
     """
-    tree = pin.Model()
-    tree.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
-    q, v, a, twist, rate = (ca.SX.sym(name, 6) for name in ("q", "v", "a", "twist", "rate"))
-    s = SpatialState(SpatialModel(tree), q, v, a, 0.0)
-    linear, spin = s.own_rates(0, np.zeros(3))
-    gain, turning = s.own_accelerations(0, np.zeros(3))
-    moving = ca.vertcat(linear, spin)
-    changing = ca.vertcat(gain - cross(spin, linear), turning)
-    slope = ca.jacobian(moving, v)
-    rates = ca.solve(slope, twist)
-    drift = ca.substitute(changing, ca.vertcat(v, a), ca.vertcat(rates, ca.SX.zeros(6)))
-    there = ca.Function("there", [q, v, a], [moving, changing])
-    back = ca.Function("back", [q, twist, rate], [rates, ca.solve(slope, rate - drift)])
-    attitude = [ca.densify(x) for x in (s.rotation(0), slope[3:, 3:])]
-    return there, back, ca.Function("attitude", [q], attitude)
+    if rates is not None:
+        tiny = 1e-30  # a step along the imaginary axis loses no digit
+        return _slopes(angles + 1j * tiny * rates).imag / tiny
+    _, roll, pitch = angles.T
+    yawing = [-np.cos(roll) * np.sin(pitch), np.sin(roll), np.cos(roll) * np.cos(pitch)]
+    rolling = [np.cos(pitch), 0 * pitch, np.sin(pitch)]
+    pitching = [0 * pitch, 0 * pitch + 1, 0 * pitch]
+    return np.array([yawing, rolling, pitching]).transpose(2, 1, 0)
+
+
+def _times(matrices: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Products (n, 3) of matrices (n, 3, 3) and columns (n, 3)."""
+    return np.einsum("nij,nj->ni", matrices, columns)
 
 
 class Turn:
@@ -260,13 +266,6 @@ class Turn:
     def into(self, x: ca.SX) -> ca.SX:
         """A vector (3,) of the outer frame in the turned one."""
         return self.turn.T @ (self.fixed.T @ x)
-
-
-def cross(x: ca.SX, y: ca.SX) -> ca.SX:
-    """Vector product (3,)."""
-    return ca.vertcat(
-        x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
-    )
 
 
 def along(axis: int, size: ca.SX) -> ca.SX:
@@ -472,26 +471,22 @@ class SpatialState:
     @property
     def inertia(self) -> ca.SX:
         """Inertia (3, 3) of all bodies as one, about the CoM, in world axes [kg m^2]."""
-        total = -self.model.mass * _spread(self.com_from_base, self.com_from_base)
-        for b, (turn, place) in zip(self.model.bodies, self._frames, strict=True):
+        com = self.com_from_base
+        total = -self.model.mass * _spread(com, com)
+        for k in self._counted:
+            b = self.model.bodies[k]
+            turn, place = self._frames[k]
             first = turn @ ca.DM(b.first)
-            total += turn @ ca.DM(b.second) @ turn.T + b.mass * _spread(place, place)
-            total += _spread(place, first) + _spread(first, place)
+            own = turn @ ca.DM(b.second) @ turn.T + b.mass * _spread(place, place)
+            own += _spread(place, first) + _spread(first, place)
+            beside = self._even and self.model.across[k] is None
+            total += own * WITH_MIRROR_IMAGE if beside else own
         return total
 
     @property
     def rho(self) -> ca.SX:
         """The paper's pitch inertia, ``inertia[1, 1]`` [kg m^2]."""
-        com = self.com_from_base
-        total = -self.model.mass * (com[0] ** 2 + com[2] ** 2)
-        for k in self._counted:
-            b = self.model.bodies[k]
-            turn, place = self._frames[k]
-            level = ca.vertcat(place[0], 0, place[2])
-            own = turn[1, :] @ ca.DM(b.second) @ turn[1, :].T + b.mass * ca.sumsqr(level)
-            own += 2 * ca.dot(level, turn @ ca.DM(b.first))
-            total += own * (2 if self._even and self.model.across[k] is None else 1)
-        return total
+        return self.inertia[1, 1]
 
     @property
     def rho_rate(self) -> ca.SX:
@@ -558,4 +553,4 @@ def rates(of: Callable[[ca.SX], ca.SX], q: ca.SX, v: ca.SX) -> ca.SX:
 
 def _spread(x: ca.SX, y: ca.SX) -> ca.SX:
     """(3, 3): x . y times the unit matrix, less the dyad y x'."""
-    return ca.dot(x, y) * ca.SX.eye(3) - y @ x.T
+    return ca.skew(x).T @ ca.skew(y)

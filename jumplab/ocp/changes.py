@@ -57,7 +57,7 @@ def changed(
     for owner, extra in (terms or {}).items():
         for term in extra:
             problem = _with(problem, owner, term, look or _digest)
-    problem.check_names([*weights, *off], "weight or switch")
+    problem.check_names(off, "weight or switch")
     for name, weight in weights.items():
         problem = _weighted(problem, name, weight)
     for owner, term in problem.terms():
@@ -90,11 +90,7 @@ def _mapped(problem: Problem, change: Callable) -> Problem:
 
 def _weighted(problem: Problem, name: str, weight: Any) -> Problem:
     """The problem with another weight of a cost."""
-    costs = {(o, t.name) for o, t in problem.terms() if t.is_cost and is_named(o, t, (name,))}
-    if not costs:
-        raise InputError(
-            f"{problem.name}: {name!r} is a constraint and has no weight; switch it off instead"
-        )
+    costs = problem.costs(name)
     _check_weight(name, weight)
     return _mapped(
         problem, lambda o, x: replace(x, weight=float(weight)) if (o, x.name) in costs else x

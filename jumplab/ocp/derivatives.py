@@ -291,18 +291,14 @@ def chain_term(phase: Phase) -> Term:
     Without jerk variables it is a linear acceleration, of the integrated coordinates alone.
     """
 
-    def defects(left: Point, right: Point, step: ca.SX) -> list[ca.SX]:
+    def missed(left: Point, right: Point, step: ca.SX) -> ca.SX:
         reached = chain(left.q, left.v, left.a, left.j, step)
         pairs = zip("qva", (right.q, right.v, right.a), reached, strict=True)
-        return [(there - x) / phase.scale(key) for key, there, x in pairs]
-
-    def exact(left: Point, right: Point, step: ca.SX) -> ca.SX:
-        return ca.vertcat(*defects(left, right, step))
-
-    def linear(left: Point, right: Point, step: ca.SX) -> ca.SX:
+        place, rate, accel = ((there - x) / phase.scale(key) for key, there, x in pairs)
+        if phase.exact:
+            return ca.vertcat(place, rate, accel)
         which = [phase.coordinates.index(name) for name in phase.integrated]
-        place, rate, _ = defects(left, right, step)
         return ca.vertcat(rate[which], place[which])
 
-    words = JERK_CHAIN, "state equation, Sec. III-A, V-A", "scaled", "interval"
-    return Term(*words, exact if phase.exact else linear, identity=True)
+    words = "state equation, Sec. III-A, V-A", "scaled", "interval"
+    return Term(JERK_CHAIN, *words, missed, identity=True)

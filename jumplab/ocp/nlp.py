@@ -91,8 +91,7 @@ def left_s() -> float:
 class Nlp:
     """A problem ready to be solved for any target.
 
-    Building is pure and done once; :meth:`solve` may be called for any parameters, weights and
-    switches.
+    Building is pure and done once; :meth:`solve` may be called for any parameters and weights.
 
     Parameters
     ----------
@@ -139,7 +138,6 @@ class Nlp:
         *,
         references: Mapping | None = None,
         weights: Mapping[str, float] | None = None,
-        off: tuple[str, ...] = (),
         multipliers: Multipliers | None = None,
         explain: bool = True,
     ) -> Solution:
@@ -151,7 +149,6 @@ class Nlp:
         guess : phase name -> initial values.
         references : phase name -> reference name -> (size, N + 1).
         weights : term name (or "phase/name") -> weight, instead of the term's own.
-        off : names of terms and bounds to leave out.
         multipliers : of a solution close by, on any mesh; used if ipopt's option
             ``warm_start_init_point`` is "yes".
         explain : look for the terms in conflict if there is no solution; it costs about as much as
@@ -166,7 +163,7 @@ class Nlp:
             says which terms are violated, where and by how much.
         """
         a = self.assembled
-        posed = pose(a, parameters, guess, references, weights, off)
+        posed = pose(a, parameters, guess, references, weights)
         check_start(a, posed)
         start = {}
         if multipliers is not None:
@@ -201,7 +198,6 @@ class Nlp:
             rows=len(g),
             objective=float(answer["f"]),
             residual=residual,
-            functions_s=sum(s for key, s in stats.items() if key.startswith("t_proc_nlp_")),
         )
         return Solution(
             unpack(a, x),

@@ -6,7 +6,7 @@ Outside they are in physical units, inside divided by their scales.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from jumplab.errors import InputError, quoted
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.layout import PhaseLayout
-from jumplab.ocp.problem import Bound, is_named
+from jumplab.ocp.problem import Bound
 from jumplab.ocp.solution import Multipliers, PhaseGuess, PhaseSolution, resampled
 
 WHERE = {"all": slice(None), "start": slice(1), "inner": slice(1, None), "end": slice(-1, None)}
@@ -49,26 +49,20 @@ def pose(
     guess: Mapping[str, PhaseGuess],
     references: Mapping | None = None,
     weights: Mapping[str, float] | None = None,
-    off: tuple[str, ...] = (),
 ) -> Posed:
     """The numbers of one target (see :class:`Posed`); arguments as of :meth:`.Nlp.solve`.
 
     Raises :class:`InputError` for whatever does not fit.
     """
     weights = weights or {}
-    a.problem.check_names([*weights, *off], "weight or switch")
     for name in weights:
-        if not any(is_named(owner, t, (name,)) for owner, t in a.cost_terms):
-            raise InputError(
-                f"{a.problem.name}: {name!r} is a constraint and has no weight; switch it off "
-                "instead"
-            )
-    p = _data(a, parameters, references or {}, weights, off)
-    box = variable_bounds(a, parameters, off)
-    return Posed(np.clip(pack(a, guess), *box), p, box, row_bounds(a, parameters, off))
+        a.problem.costs(name)
+    p = _data(a, parameters, references or {}, weights)
+    box = variable_bounds(a, parameters)
+    return Posed(np.clip(pack(a, guess), *box), p, box, row_bounds(a, parameters))
 
 
-def _data(a: Assembled, parameters, references, weights, off) -> np.ndarray:
+def _data(a: Assembled, parameters, references, weights) -> np.ndarray:
     """The data vector (p_size,)."""
     problem = a.problem
     unknown = set(parameters) ^ set(problem.parameters)
@@ -86,9 +80,7 @@ def _data(a: Assembled, parameters, references, weights, off) -> np.ndarray:
         )
     for owner, t in a.cost_terms:
         weight = weights.get(f"{owner}/{t.name}", weights.get(t.name, t.weight))
-        off_here = is_named(owner, t, off)
-        what = f"{problem.name}: weight {t.name!r}"
-        values.append(_fitting([0.0 if off_here else weight], (1,), what))
+        values.append(_fitting([weight], (1,), f"{problem.name}: weight {t.name!r}"))
     for name, layout in a.layouts.items():
         values.append(_node_data(layout, references.get(name, {}), problem.name))
     return np.concatenate(values)
@@ -131,15 +123,13 @@ def _resolve(value: Any, parameters: Any, size: int) -> np.ndarray:
     return np.broadcast_to(np.asarray(value, float).ravel(), (size,))
 
 
-def row_bounds(a: Assembled, parameters: Any, off: Container[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of all rows (n_rows,), scaled; none for terms that are ``off``."""
+def row_bounds(a: Assembled, parameters: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of all rows (n_rows,), scaled."""
     low = np.full(a.n_rows, -np.inf)
     high = np.full(a.n_rows, np.inf)
     for rows in a.rows:
         term = rows.term
         count = rows.index.shape[1]
-        if is_named(rows.owner, term, off):
-            continue
         try:
             low[rows.index] = _resolve(term.lower, parameters, count) / term.scale
             high[rows.index] = _resolve(term.upper, parameters, count) / term.scale
@@ -151,9 +141,7 @@ def row_bounds(a: Assembled, parameters: Any, off: Container[str]) -> tuple[np.n
     return low, high
 
 
-def variable_bounds(
-    a: Assembled, parameters: Any, off: Container[str]
-) -> tuple[np.ndarray, np.ndarray]:
+def variable_bounds(a: Assembled, parameters: Any) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds of all variables (size,), scaled.
 
     Raises :class:`InputError` if bounds exclude each other.
@@ -169,8 +157,7 @@ def variable_bounds(
             low[i] = _resolve(lower, parameters, 1)[0] / size
             high[i] = _resolve(upper, parameters, 1)[0] / size
         for bound in phase.bounds:
-            if not is_named(phase.name, bound, off):
-                _tighten(layout, bound, parameters, low, high)
+            _tighten(layout, bound, parameters, low, high)
     return low, high
 
 

@@ -292,6 +292,20 @@ class Problem:
                     f"{nearest({x.name for _, x in self.items()}, name)}"
                 )
 
+    def costs(self, name: str) -> dict[tuple[str, str], float]:
+        """(phase, term) -> weight of the costs that a name means, "term" or "phase/term".
+
+        Raises :class:`InputError` for a name that is no cost's.
+        """
+        self.check_names([name], "weight or switch")
+        named = [(owner, t) for owner, t in self.terms() if is_named(owner, t, (name,))]
+        costs = {(owner, t.name): t.weight for owner, t in named if t.is_cost}
+        if not costs:
+            raise InputError(
+                f"{self.name}: {name!r} is a constraint and has no weight; switch it off instead"
+            )
+        return costs
+
     def table(self) -> list[dict]:
         """One row per term and bound: stage, phase, name, kind, at, unit, equation, value (weight
         or bounds).

@@ -34,6 +34,7 @@ ROW_TOLERANCE = (
 GIVE_SHARE = 1e-3  # rows that give way by less than this share of the worst are not named
 PRICE_SHARE = 0.05  # limits with a price below this are not named
 MAX_NAMED = 5
+NO_LIMIT = 1e20  # from which on HiGHS takes a side of a row for none
 NUMBERS = tuple(map(str, range(1000)))  # labels of rows that have none
 
 
@@ -132,10 +133,6 @@ class Qp:
             _join([b.low for b in limits]),
             _join([b.high for b in limits]),
         )
-
-    def objective(self, x: np.ndarray) -> float:
-        """Value of the cost at ``x`` (n,)."""
-        return sum(float(b.weight @ (b.matrix @ x - b.low) ** 2) / 2 for b in self.costs.values())
 
     def constraints(self) -> list[Block]:
         """Equalities, then limits."""
@@ -247,12 +244,11 @@ def conflict(qp: Qp) -> Conflict | None:
     matrix = _stack([b.matrix for b in blocks], qp.size)
     low, high, scale = (_join([getattr(b, k) for b in blocks]) for k in ("low", "high", "scale"))
     names = [(b.name, label) for b in blocks for label in b.labels]
-    below, above = np.isfinite(low), np.isfinite(high)
     slack = -np.diag(scale)
     answer = linprog(
         np.concatenate([np.zeros(qp.size), np.ones(len(scale))]),
-        np.block([[-matrix[below], slack[below]], [matrix[above], slack[above]]]),
-        np.concatenate([-low[below], high[above]]),
+        np.block([[-matrix, slack], [matrix, slack]]),
+        np.nan_to_num(np.concatenate([-low, high]), posinf=NO_LIMIT),
         bounds=[(None, None)] * qp.size + [(0, None)] * len(scale),
     )
     if not answer.success:
@@ -261,12 +257,8 @@ def conflict(qp: Qp) -> Conflict | None:
     giving = [k for k in np.argsort(-give) if give[k] > max(GIVE_SHARE * give.max(), 1e-7)]
     if not giving:
         return None
-    price = np.zeros(len(scale))
-    prices = np.split(np.abs(answer.ineqlin.marginals), [below.sum()])
-    price[below] = prices[0]
-    price[above] = np.maximum(price[above], prices[1])
+    price = scale * np.abs(answer.ineqlin.marginals).reshape(2, -1).max(axis=0)
     price[: sum(len(b.labels) for b in qp.equalities.values())] = 0.0
-    price *= scale
     dear = [k for k in np.argsort(-price) if price[k] > PRICE_SHARE and k not in giving]
     gives = tuple((*names[k], float(give[k] * scale[k])) for k in giving[:MAX_NAMED])
     return Conflict(gives, tuple(names[k] for k in dear[:MAX_NAMED]))

@@ -5,7 +5,7 @@ multipliers, statistics.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -52,13 +52,6 @@ class PhaseGuess(Shown):
     a: np.ndarray | None = None
     z: np.ndarray | None = None
     constants: dict = field(default_factory=dict)
-
-    def resampled(self, intervals: int) -> PhaseGuess:
-        """The same guess at (intervals + 1) nodes, by straight lines between its own."""
-        old = np.linspace(0, 1, len(self.q))
-        new = np.linspace(0, 1, intervals + 1)
-        values = {key: x for key in "qvaz" if (x := getattr(self, key)) is not None}
-        return replace(self, **{key: resampled(old, x, new) for key, x in values.items()})
 
 
 @dataclass(frozen=True, repr=False)
@@ -107,9 +100,7 @@ class Multipliers(Shown):
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a solve cost; ``functions_s`` is the CPU time of function evaluations, the rest is the
-    solver's own.
-    """
+    """What a solve cost."""
 
     iterations: int
     status: str
@@ -119,7 +110,6 @@ class Statistics:
     rows: int
     objective: float
     residual: float
-    functions_s: float = 0.0
 
 
 @dataclass(frozen=True, repr=False)

@@ -253,7 +253,7 @@ def _feet(result: SimulationResult) -> tuple[float, float]:
     """From the measured wrenches, the most friction that a foot uses [1], and how far its CoP ever
     lies outside the sole [m].
     """
-    least = size(robot).of(LOADED_N, "N")
+    least = size(result.robot).of(LOADED_N, "N")
     loaded, side = np.nonzero(result.foot_wrench[:-1, :, 2] > least)
     if not len(loaded):
         return 0.0, 0.0

@@ -101,7 +101,7 @@ def sorted_out(
         If a stage or phase is unknown, with those that exist, or something is of another type than
         it must be.
     """
-    extra_terms, scales, gone = ({stage: {} for stage in PHASES} for _ in range(3))
+    by_stage = {stage: ({}, {}, {}) for stage in PHASES}  # own terms, weights, switches
     terms = {} if terms is None else terms
     weights = {} if weights is None else weights
     require_type(terms, Mapping, "own terms")
@@ -113,18 +113,17 @@ def sorted_out(
         extra = (extra,) if isinstance(extra, Term) else extra
         if isinstance(extra, str) or not isinstance(extra, Iterable):
             raise InputError(f"own terms of {name!r} must be a list of terms, got {quoted(extra)}")
-        extra_terms[stage][phase] = (*extra_terms[stage].get(phase, ()), *extra)
-        for term in extra_terms[stage][phase]:
+        own = by_stage[stage][0]
+        own[phase] = (*own.get(phase, ()), *extra)
+        for term in own[phase]:
             require_type(term, Term, f"an own term of {name!r}")
-    switches = [(name, None) for name in off]
-    for names, by_stage in ((weights.items(), scales), (switches, gone)):
-        for name, value in names:
-            stage, rest = _stage_of(name)
-            by_stage[stage][rest] = value
-    return {
-        stage: StageChanges(extra_terms[stage], scales[stage], tuple(gone[stage]))
-        for stage in PHASES
-    }
+    for name, value in weights.items():
+        stage, rest = _stage_of(name)
+        by_stage[stage][1][rest] = value
+    for name in off:
+        stage, rest = _stage_of(name)
+        by_stage[stage][2][rest] = None
+    return {x: StageChanges(own, new, tuple(gone)) for x, (own, new, gone) in by_stage.items()}
 
 
 def _stage_and_phase(name: Any) -> tuple[str, str]:

@@ -50,8 +50,8 @@ class JumpPlan(Shown, Named):
         planned.
     tape : the 1 kHz tape of the full robot.
     summary : what ``summary.json`` says: target, results, cost of the stages; plain types.
-    srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage
-        2).
+    srmp, joints : results of stages 1 and 2 (None for the direct planner; re-plans and flips have
+        no stage 2).
     whole_body : result of stage 3 or of the direct planner; results of stages are None if the plan
         was read from a result folder.
     contacts : the schedule that was asked for; None for a standing jump.
@@ -78,21 +78,16 @@ class JumpPlan(Shown, Named):
         srmp: SrmpPlan | None = None,
         joints: JointPlan | None = None,
         *,
-        skipped: str | None = None,
         contacts: Contacts | None = None,
     ) -> JumpPlan:
         """The plan that results of the stages make; arguments as attributes of the same names, the
         robot as on Earth.
-
-        ``skipped`` says why stage 2 is missing (``joints`` are None), in a flip that it cannot
-        follow.
         """
         robot = robot.under_gravity(body.task.gravity)
         tape = make_tape(body, srmp)
         summary = planned(tape) | _summary(robot, method, tape, body, srmp, joints)
-        summary["skipped"] = skipped
-        summary["contacts"] = contacts and [p.feet for p in contacts.phases]
-        summary = {key: value for key, value in summary.items() if value is not None}
+        if contacts is not None:
+            summary["contacts"] = [p.feet for p in contacts.phases]
         return cls(body.task, robot, method, tape, summary, srmp, joints, body, contacts)
 
     @classmethod
@@ -141,20 +136,13 @@ class JumpPlan(Shown, Named):
 
     @property
     def statistics(self) -> tuple[StageRow, ...]:
-        """One row per stage; stage 2's is called "2 joint map, gentle" where it had to follow less
-        closely.
-        """
+        """One row per stage."""
         return Rows(StageRow(**row) for row in self.summary["stages"])
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
         """Starts of the whole-body program that were tried, what they took, and how they ended."""
         return Rows(Attempt(**row) for row in self.summary.get("attempts", ()))
-
-    @property
-    def skipped(self) -> str | None:
-        """Why stage 2 is missing, in a flip that it cannot follow; None if nothing is."""
-        return self.summary.get("skipped")
 
     @property
     def schedule(self) -> tuple[str, ...]:
@@ -299,11 +287,7 @@ def _summary(
             "iterations": s.iterations,
             "residual": s.worst_residual,
         }
-        name = "2 joint map"
-        if joints.gentle:
-            solvers["joint map"]["gentle"] = joints.gentle
-            name += ", gentle"
-        rows.append(StageRow(name, s.iterations, s.total_s - s.solve_s, s.solve_s))
+        rows.append(StageRow("2 joint map", s.iterations, s.total_s - s.solve_s, s.solve_s))
     weights["whole body"], solvers["whole body"] = _solved(body.solution)
     build_s = body.solution.statistics.build_s
     stage = "direct" if srmp is None else "3 whole body"

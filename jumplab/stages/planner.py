@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jumplab.arguments import checked
-from jumplab.errors import InputError, Shown, SolverError, quoted, require_type
+from jumplab.errors import InputError, Shown, quoted, require_type
 from jumplab.io.columns import Rows
 from jumplab.models.full import FullBody
 from jumplab.ocp import Problem, Term
@@ -42,7 +42,7 @@ from jumplab.stages.whole_body.bounds import refuse_impossible
 from jumplab.stages.whole_body.ground import surface_of_jump
 from jumplab.stages.whole_body.motions import Motion
 from jumplab.stages.whole_body.program import Program
-from jumplab.stages.whole_body.starts import COMPARED, FOLLOWED, GIVEN
+from jumplab.stages.whole_body.starts import COMPARED, FOLLOWED
 from jumplab.task import GRAVITY, JumpTask
 
 METHODS = ("three-step", "direct")
@@ -55,7 +55,6 @@ LINKS = 5  # of the robot in the plane
 LEAST_RISE_M = 0.02  # that a target can say
 ANY = JumpTask(0.5, 0.3)  # a jump straight ahead: its terms are those of all of them
 NOTHING: Mapping[str, float] = MappingProxyType({})
-OTHERWISE = "stage 3 began without it instead"  # in words, where stage 2 cannot follow
 _COUNT = count()
 
 
@@ -210,7 +209,7 @@ class Planner(Shown):
         if self.chosen(method) == "direct":
             return Rows(self.program(task).nlp.problem.table())
         first, last = (self.stage(name, flip=flip).nlp.problem.table() for name in ("srmp", LAST))
-        return Rows([*first, *self._joint_problem().table(), *last])
+        return Rows([*first, *([] if flip else self._joint_problem().table()), *last])
 
     # what is refused
     # ------------------------------------------------------------------------------------------
@@ -268,9 +267,13 @@ class Planner(Shown):
                 )
             asked[LAST].applied(self.program(task, asked[LAST].weights).nlp.problem)
             return asked
+        flip = bool(task.rotation_rad)
+        if flip and self._joint_changes(asked["joint qp"]):
+            raise InputError("flips have no stage 2; leave out all that is changed of 'joint qp'")
         for name in ("srmp", LAST):
-            asked[name].applied(self.stage(name, flip=bool(task.rotation_rad)).nlp.problem)
-        self._joint_problem(asked["joint qp"])
+            asked[name].applied(self.stage(name, flip=flip).nlp.problem)
+        if not flip:
+            self._joint_problem(asked["joint qp"])
         return asked
 
     def _check(self, task: JumpTask, method: str, start: np.ndarray | None) -> None:
@@ -320,9 +323,10 @@ class Planner(Shown):
         ----------
         task : the target.
         method : "direct" (the whole body alone) or "three-step" (SRMP, joint-space QPs, whole body;
-            as in the paper), for targets in the plane. "usual" is "direct", which takes less time
-            and ends in jumps of less effort (``notebooks/10_benchmark``), but "three-step" where
-            something of stages 1 and 2, or of stage 3's tracking, is changed.
+            as in the paper, but flips without the QPs), for targets in the plane. "usual" is
+            "direct", which takes less time and ends in jumps of less effort
+            (``notebooks/10_benchmark``), but "three-step" where something of stages 1 and 2, or of
+            stage 3's tracking, is changed.
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles
             flat; the stance if None. Not for flips, nor for robots that no plane describes.
@@ -366,24 +370,13 @@ class Planner(Shown):
             weights=asked["srmp"].weights,
         )
         joints = None
-        skipped = None
-        if near is None:
-            try:
-                changes = self._joint_changes(asked["joint qp"])
-                stance = begin.get("stance")
-                joints = map_to_joints(srmp, self.robot, STEPS_S, q0=stance, changes=changes)
-                begin["begin"] = motion_of_joints(joints, last, srmp.toe_s)
-            except SolverError as e:
-                if not flip:
-                    raise
-                # rates of 20 rad/s in every link are no feedback's business, and stage 2's
-                # reference says nothing of the tuck
-                skipped = f"{e}; {OTHERWISE}"
+        if near is None and not flip:
+            changes = self._joint_changes(asked["joint qp"])
+            stance = begin.get("stance")
+            joints = map_to_joints(srmp, self.robot, STEPS_S, q0=stance, changes=changes)
+            begin["begin"] = motion_of_joints(joints, last, srmp.toe_s)
         body = last.plan(task, srmp, **begin)
-        if flip and joints is not None and body.start != GIVEN[0].name:
-            skipped = f"stage 2: its motion led nowhere; {OTHERWISE}"
-            joints = None
-        return JumpPlan.of(self.robot, method, body, srmp, joints, skipped=skipped)
+        return JumpPlan.of(self.robot, method, body, srmp, joints)
 
     def _direct(self, task: JumpTask, begin: Mapping[str, Any], starts: int) -> WholeBodyPlan:
         """The whole body alone; an atlas's plan close by first, where there is one."""

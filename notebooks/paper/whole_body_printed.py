@@ -18,6 +18,7 @@ import numpy as np
 
 from jumplab.errors import SolverError
 from jumplab.io.tape import RATE_HZ
+from jumplab.ocp import changed
 from jumplab.ocp.nlp import Nlp, PhaseGuess, Solution
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import SAGITTAL_JOINTS, Robot, SagittalModel
@@ -233,6 +234,7 @@ class PrintedWholeBody:
     def __init__(self, robot: Robot, weights: Weights = Weights(), intervals: int = INTERVALS, *,
                  options: Mapping = OPTIONS):  # fmt: skip
         self.robot, self.coordinates = robot, PaperCoordinates(robot.sagittal)
+        self.options = options
         self.launch, self.flight = (Nlp(p, options) for p in build_printed(robot, weights, intervals))
         self._share = np.linspace(0, 1, intervals + 1)
         turn, place = np.zeros((1, 5)), np.zeros((1, 2))
@@ -288,8 +290,9 @@ class PrintedWholeBody:
         part, said, flight = srmp.flight, [], None
         refs = {"flight": {k: self._at_nodes(part.t, getattr(part, k)).T for k in ("rho", "rho_rate")}}
         for off in ((), (AT_TAKEOFF,)):
+            solver = Nlp(changed(self.flight.problem, off=off), self.options) if off else self.flight
             try:
-                flight = self.flight.solve(data, guess, references=refs, off=off)
+                flight = solver.solve(data, guess, references=refs)
                 said.append(flight.statistics.status)
                 break
             except SolverError as failed:

@@ -133,7 +133,7 @@ class PhaseQp:
         back, forth = np.minimum(motors.speed, approach)
         return (-back - rates) / step_s, (forth - rates) / step_s
 
-    def _asked(self, k: int, now: FullTerms, nominal: np.ndarray, **more) -> SimpleNamespace:
+    def _asked(self, k: int, now: FullTerms, **more) -> SimpleNamespace:
         """What both phases ask for, from the quantities at the start of step ``k``, and ``more``.
 
         time : middle of the step, since the phase began [s].
@@ -142,12 +142,12 @@ class PhaseQp:
         acceleration_range : least and greatest of the joints (nv - 6,), see :meth:`joint_range`.
         """
         gain = self.options.gains
-        wish = pin.Quaternion(nominal[3:7])
+        wish = pin.Quaternion(self.nominal[3:7])
         left = (wish.conjugate() * pin.Quaternion(now.q[3:7])).coeffs()  # vector, scalar
         turned = 2 * np.sign(left[3] or 1.0) * left[:3]  # q and -q are the same orientation
         return SimpleNamespace(
             time=float(self.t[k] + self.steps[k] / 2),
-            joints=gain.posture.back(now.q[7:] - nominal[7:], now.v[6:]),
+            joints=gain.posture.back(now.q[7:] - self.nominal[7:], now.v[6:]),
             trunk=gain.trunk.back(turned, now.v[3:6]),
             symmetry=gain.contact.back(self.S[:, 6:] @ now.q[7:], self.S @ now.v),
             acceleration_range=self.joint_range(now.q[7:], now.v[6:], self.steps[k]),
@@ -220,7 +220,6 @@ class LaunchQp(PhaseQp):
         return self._asked(
             k,
             now,
-            self.nominal,
             com_acceleration=self.com.command(k, place, now.com_velocity, gain.com),
             momentum_rate=turn,
             inertia_accel=self.inertia.command(k, now.rho, now.rho_rate, gain.inertia),
@@ -251,8 +250,6 @@ class FlightQp(PhaseQp):
     Attributes
     ----------
     inertia, foot : what is followed; the soles (2, 3) from the CoM.
-    turn : (n + 1,) how far trunk and feet shall have rotated about +y [rad]: zero, or a share of
-        the flip's 2 pi.
     """
 
     def __init__(
@@ -275,9 +272,6 @@ class FlightQp(PhaseQp):
         foot[:, :, 1] = start.foot_com[:, 1]  # the feet keep their distance
         both = Track(t, foot, in_space(reference.foot_com_rate)[:, None].repeat(2, axis=1))
         self.foot = both.from_state(start.foot_com, start.J_rd @ start.v, FOOT_BLEND_S)
-        lean = reference.lean - reference.lean[0]
-        whole = np.round(lean[-1] / (2 * np.pi)) * 2 * np.pi  # full turns only; leaning is no flip
-        self.turn = whole * lean / lean[-1] if whole else np.zeros_like(t)
 
     def target(self, k: int, now: FullTerms) -> SimpleNamespace:
         """Feed-forward + PD of step ``k`` from the quantities at its start.
@@ -289,21 +283,16 @@ class FlightQp(PhaseQp):
         momentum, physically zero [N, N m].
         """
         gain = self.options.gains
-        turn = self.turn[k]
-        turn_rate = (self.turn[k + 1] - turn) / self.steps[k]
-        tilt = np.angle(np.exp(1j * (now.foot_pitch - turn)))  # the short way round
         rate = now.J_rd @ now.v
         target = self._asked(
             k,
             now,
-            turned(self.nominal, turn),
             foot_accel=self.foot.command(k, now.foot_com, rate, gain.foot),
-            foot_pitch=gain.foot_level.back(tilt, now.tip.velocity[:, 4] - turn_rate),
+            foot_pitch=gain.foot_level.back(now.foot_pitch, now.tip.velocity[:, 4]),
             inertia_accel=self.inertia.command(k, now.rho, now.rho_rate, gain.inertia),
             floor=np.full(4, -np.inf),
             base_force=self._drift(k, now),
         )
-        target.trunk[1] += gain.trunk.damping * turn_rate
         if self.t[k] <= self.t[-1] / 2:  # coming down, the surface is the landing's business
             height = np.stack([now.tip.place[:, 2], now.heel.place[:, 2]], 1).ravel()
             speed = np.stack([now.tip.velocity[:, 2], now.heel.velocity[:, 2]], 1).ravel()
@@ -337,11 +326,3 @@ def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
         if SAGITTAL_JOINTS[row] == "shoulder":
             q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * sign
     return q
-
-
-def turned(q: np.ndarray, angle: float) -> np.ndarray:
-    """Configuration (nq,) with its base turned by ``angle`` [rad] about the world's +y."""
-    out = q.copy()
-    about = pin.Quaternion(pin.AngleAxis(angle, np.array([0.0, 1.0, 0.0])))
-    out[3:7] = (about * pin.Quaternion(q[3:7])).coeffs()
-    return out

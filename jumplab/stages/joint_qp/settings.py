@@ -109,21 +109,3 @@ class Options:
     limits: Limits = Limits()
     # shoulder angle of the posture that the joints lean towards, forward negative: arms swing up
     arm_rad: float = -1.5
-
-
-# For a stage 1 that asks for more than the joints can give: followed firmly, it drives them into
-# their stops. This follows less closely, but arrives: the CoM at 20 rad/s and no stronger forwards,
-# L and rho weaker
-GENTLE = Options(
-    gains=Gains(com=Gain(400.0, 40.0)),
-    launch=LaunchWeights(
-        com=3.0,
-        force=3e-3,
-        com_x=3.0,
-        force_x=3e-3,
-        moment=1.0,
-        inertia=3e-3,
-        inertia_toe=6e-5,
-        inertia_fade_s=0.01,
-    ),
-)

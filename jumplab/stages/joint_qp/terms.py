@@ -18,7 +18,6 @@ from jumplab.errors import InputError, quoted
 from jumplab.models.full import SIDES, FullBody, force_target
 from jumplab.ocp import Phase, Problem, Term
 from jumplab.ocp.changes import ends
-from jumplab.ocp.problem import is_named
 from jumplab.robot.contact import wrench_rows
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.joint_qp.point import Affine, StepPoint
@@ -249,12 +248,7 @@ def changed_problem(
                 f"weight {name!r} of 'joint qp' = {quoted(factor)}: "
                 f"its factor must be a number of 0 or more"
             )
-        costs = {
-            f"{phase}/{term.name}": factor * term.weight
-            for phase, term in problem.terms()
-            if term.is_cost and is_named(phase, term, (name,))
-        }
-        weights |= costs or {name: factor}
+        weights |= {"/".join(cost): factor * usual for cost, usual in problem.costs(name).items()}
     return replace(changes, terms={}, weights=weights).applied(problem)
 
 

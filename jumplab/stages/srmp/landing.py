@@ -105,9 +105,12 @@ class LandingPlan(SrmpStance):
         """CoM (2,), its velocity (2,) and L at ``time`` since touchdown; the last sample holds for
         ever.
         """
-        columns = np.column_stack([self.com, self.com_velocity, self.L])
-        now = np.array([np.interp(time, self.t, x) for x in columns.T])
+        now = self._at(time, self.com, self.com_velocity, self.L)
         return now[:2], now[2:4], float(now[4])
+
+    def _at(self, time: float, *columns: np.ndarray) -> np.ndarray:
+        """Columns (n,) or (n, 2) at a ``time``, one after the other."""
+        return np.array([np.interp(time, self.t, x) for x in np.column_stack(columns).T])
 
     def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
         """CoM acceleration (2,) [m/s^2] and dL/dt [N m] at ``time`` since touchdown; zero once the
@@ -116,10 +119,9 @@ class LandingPlan(SrmpStance):
         A controller that follows only :meth:`at` pushes with little more than the weight until it
         lags behind.
         """
-        if time >= self.t[-1] or self.com_acceleration is None:
+        if time >= self.t[-1]:
             return np.zeros(2), 0.0
-        columns = np.column_stack([self.com_acceleration, self.L_rate])
-        now = np.array([np.interp(time, self.t, x) for x in columns.T])
+        now = self._at(time, self.com_acceleration, self.L_rate)
         return now[:2], float(now[2])
 
 

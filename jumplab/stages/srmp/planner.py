@@ -15,6 +15,7 @@ from jumplab.models.srmp import SrmpState
 from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
 from jumplab.ocp.cache import in_turn
 from jumplab.ocp.nlp import WARM
+from jumplab.ocp.solution import quintic
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.stages.changes import StageChanges
@@ -274,18 +275,18 @@ def on_ground(
 def _sample_flight(
     flight: PhaseSolution, takeoff_length: float, gravity: float, t: np.ndarray
 ) -> SrmpFlight:
-    from scipy.interpolate import BPoly, CubicHermiteSpline  # slow to import
+    from scipy.interpolate import CubicHermiteSpline  # slow to import
 
     rho, rho_v, rho_a = (x[:, 0] for x in flight.sample(t))
     c = flight.constants
     # theta between nodes: the cubic through the node values with the exact rates L / rho
     theta = CubicHermiteSpline(flight.t, flight.z[:, 0], c["L"] / flight.q[:, 0])(t)
     # only the ends of the leg's length matter, the rod has no mass
-    ends = [takeoff_length, 0.0, 0.0], [c["leg"], 0.0, 0.0]
-    leg = BPoly.from_derivatives([0.0, flight.duration], ends)
+    ends = [(takeoff_length, c["leg"]), (0.0, 0.0), (0.0, 0.0)]
+    leg, leg_rate, _ = quintic(ends, flight.duration, t)
     along = -np.stack([np.sin(theta), np.cos(theta)], -1)
     across = np.stack([along[:, 1], -along[:, 0]], -1)
-    length, speed, turning = (x[:, None] for x in (leg(t), leg.derivative()(t), c["L"] / rho))
+    length, speed, turning = (x[:, None] for x in (leg, leg_rate, c["L"] / rho))
     fall = np.array([0.0, -gravity])
     velocity = np.array([c["vel_x"], c["vel_z"]])
     time = t[:, None]
