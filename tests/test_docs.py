@@ -277,8 +277,8 @@ def test_a_notebook_begins_with_its_result_and_says_when_its_comments_hold(path)
 
 
 def reading(path):
-    """(words, looks) of a notebook as it opens: what stands below a collapsed heading and cells that are folded whole do
-    not count; a look is a cell whose code or output is in sight.
+    """(words, looks) of a notebook as it opens: what stands below a collapsed heading, and cells that are folded whole,
+    do not count; a look is a cell whose code or output is in sight.
     """
     words = looks = 0
     closed = 9  # level of the collapsed heading above

@@ -189,7 +189,11 @@ def record(
     *,
     share: float = 0.95,
     engines: Sequence[str] = INSTALLED,
-    **changes: Any,
+    terms: Mapping[str, Iterable[Term]] | None = None,
+    weights: Mapping[str, float] | None = None,
+    off: Iterable[str] = (),
+    limits: Limits | Mapping[str, Any] | None = None,
+    mesh: Mesh | Mapping[str, int] | None = None,
 ) -> Record:
     """The largest ``what`` of a target that a plan was found for, and what ends it.
 
@@ -202,7 +206,7 @@ def record(
     share : of the record, of the plan that is played first; a smaller one follows where a robot
         falls.
     engines : in which it is played; none with ().
-    changes : own ``limits``, ``mesh``, ``weights`` and so on, as of :class:`jumplab.Planner`.
+    terms, weights, off, limits, mesh : as of :class:`jumplab.Planner`.
 
     Raises
     ------
@@ -219,6 +223,7 @@ def record(
     for engine in engines:
         if engine not in ENGINES:
             raise InputError(f"engine {quoted(engine)}: choose of {', '.join(ENGINES)}, or none")
+    changes = dict(terms=terms, weights=weights, off=off, limits=limits, mesh=mesh)
     planner = Planner(robot, keep=True, **changes)
     with unexplained():
         search = _Search(planner, what, given)
@@ -228,7 +233,7 @@ def record(
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
     bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
-    if given is None and not changes:
+    if given is None and not any(changes.values()):
         keep_record(robot, what, value)
     made = plan, plan.audit, found, ends, share, reserve, runs
     asked = {"given": given, "share": share, "engines": engines, **changes}
