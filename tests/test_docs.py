@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import json
 import re
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 from paper import tuning, worlds
 
+import jumplab as jl
 from jumplab.auditing.report import LIMITS
 from jumplab.cli import main as command_line
 from jumplab.cli import notebooks
@@ -234,6 +236,8 @@ def prose():
                 yield from ((f"{path.name}[{number}] code", text) for text in texts)
     yield "README.md", README
     yield from ((f"{name}.md", page) for name, page in PAGES.items())
+    for owner in (jl, jl.plots):
+        yield from ((f"{name}'s help", inspect.getdoc(getattr(owner, name)) or "") for name in owner.__all__)
     yield "options.toml", (ROOT / "jumplab" / "cli" / "options.toml").read_text(encoding="utf-8")
     for path in MODULES:
         yield from ((short(path), text) for text in texts_of(path.read_text(encoding="utf-8"), sentences=True))

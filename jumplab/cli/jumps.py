@@ -96,7 +96,7 @@ def plan(args: Namespace) -> None:
 
 
 def audit(args: Namespace) -> None:
-    """Check a plan by a second code path."""
+    """Check a plan by an independent implementation."""
     store.read_plan(args.dir)  # refuses a damaged folder
     folder = store.ensure_writable(args.dir)
     with store.transaction(folder) as staging:
