@@ -143,8 +143,8 @@ def _followed(
 
 @checked
 def audit(plan: JumpPlan) -> AuditReport:
-    """Check a plan by an independent implementation that sees its tape, its robot and its target, and nothing
-    of the planner: :attr:`jumplab.JumpPlan.audit`, made once.
+    """Check a plan by an independent implementation that sees its tape, its robot and its target,
+    and nothing of the planner: :attr:`jumplab.JumpPlan.audit`, made once.
     """
     return plan.audit
 

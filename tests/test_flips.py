@@ -258,6 +258,7 @@ def test_three_steps_say_what_they_skipped():
     assert plan.srmp is not None and passport.audit(plan.tape, plan.robot, plan.task).passed
     assert (plan.whole_body.start == GIVEN[0].name) == (plan.skipped is None)
     assert (plan.joints is None) == bool(plan.skipped) == ("skipped" in plan.summary)
+    assert ("without stage 2" in plan.line()) == bool(plan.skipped)
     unsettled = r"stage 2: at t = 0\.0\d\d s of the flight rates change within one step of 0\.020 s by \d\.\d m/s "
     unsettled += r"or rad/s more than its program foresees, at most 2 can be mended; take shorter steps or a slower "
     unsettled += r"motion"

@@ -250,6 +250,8 @@ def print_summary(summary: Mapping[str, Any]) -> None:
     line = "{stage:<22}{iterations:>11}{build_s:>8.2f} s{solve_s:>8.2f} s"
     for row in summary["stages"]:
         print(line.format_map(row))
+    if summary.get("skipped"):
+        print(f"without stage 2: {summary['skipped']}")
     line = "planned: distance {planned_distance_m:.3f} m, rise {planned_rise_m:.3f} m"
     if summary.get("planned_side_m") is not None:
         line += ", side {planned_side_m:.3f} m, turn {turn_deg:.1f} deg"

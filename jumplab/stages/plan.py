@@ -118,7 +118,8 @@ class JumpPlan(Shown, Named):
         if self.task.rotation_rad:
             jump += f", turned by {round(math.degrees(self.task.rotation_rad))} deg"
         jump += f", rise {self.planned_rise_m:.2f} m"
-        words = f"{self.robot.name}, {jump}, {self.method}, {float(self.tape.t[-1]):.2f} s"
+        how = self.method + " without stage 2" * bool(self.skipped)
+        words = f"{self.robot.name}, {jump}, {how}, {float(self.tape.t[-1]):.2f} s"
         if "audit" not in vars(self) or (self.audit.sound and all(self.landings)):
             return words
         return f"{words}; {self.verdict}"

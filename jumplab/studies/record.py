@@ -8,7 +8,7 @@ from several easy jumps: a record is what it found "at least".
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -20,12 +20,12 @@ from jumplab.auditing import AuditReport
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
-from jumplab.ocp.problem import Phase
+from jumplab.ocp.problem import Phase, Term
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Limits, bounds
+from jumplab.stages.whole_body import Limits, Mesh, bounds
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.problem import SOUGHT
 from jumplab.stages.whole_body.program import Program, Solved
