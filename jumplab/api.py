@@ -8,24 +8,29 @@ import math
 import sys
 import tempfile
 import warnings
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jumplab.arguments import checked
+from jumplab.control import STAND_S
 from jumplab.errors import InputError
 from jumplab.io import folder as folders
-from jumplab.ocp import cache
+from jumplab.ocp import Term, cache
 from jumplab.ocp.nlp import patience
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
+from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.stages.whole_body import Contacts
+from jumplab.stages.whole_body.settings import Limits, Mesh
 from jumplab.task import JumpTask
 
 if TYPE_CHECKING:  # what only some of the functions need is imported by them
     from jumplab.auditing import AuditReport, ClipReport
     from jumplab.show.viewer import Page
-    from jumplab.sim import Ranges, SimulationResult
+    from jumplab.sim import Perturbation, Ranges, Scene, SimulationResult
+    from jumplab.studies.atlas import Atlas
     from jumplab.studies.mend import Mended
 
 
@@ -47,7 +52,13 @@ def plan(
     robust: Ranges | None = None,
     patience_s: float = math.inf,
     starts: int = 1,
-    **changes: Any,
+    terms: Mapping[str, Iterable[Term]] | None = None,
+    weights: Mapping[str, float] | None = None,
+    off: Iterable[str] = (),
+    limits: Limits | Mapping[str, Any] | None = None,
+    settings: SrmpSettings | Mapping[str, Any] | None = None,
+    mesh: Mesh | Mapping[str, int] | None = None,
+    atlas: Atlas | None = None,
 ) -> JumpPlan:
     """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz
     tape.
@@ -73,8 +84,8 @@ def plan(
         found or a refusal [s].
     starts : how many starts are tried to the end, of which the cheapest plan counts; its
         ``attempts`` say how the others differ. See :meth:`jumplab.Planner.plan`.
-    changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and
-        ``mesh``, as of :class:`jumplab.Planner`, which plans many targets with them.
+    terms, weights, off, limits, settings, mesh, atlas : as of :class:`jumplab.Planner`, which plans
+        many targets with them.
 
     Raises
     ------
@@ -86,6 +97,8 @@ def plan(
     from jumplab.studies.advice import plan_or_advise
 
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+    changes = dict(terms=terms, weights=weights, off=off, limits=limits, settings=settings)
+    changes |= dict(mesh=mesh, atlas=atlas)
     if (task is None) == (contacts is None):
         raise InputError(
             "give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)"
@@ -130,15 +143,19 @@ def _followed(
 
 @checked
 def audit(plan: JumpPlan) -> AuditReport:
-    """Check a plan by a second code path that sees its tape, its robot and its target, and nothing
-    of the planner: :attr:`jumplab.JumpPlan.audit`, made once.
+    """Check a plan by an independent implementation that sees its tape, its robot and its target,
+    and nothing of the planner: :attr:`jumplab.JumpPlan.audit`, made once.
     """
     return plan.audit
 
 
 @checked
 def judge(
-    motion: Any, robot: Robot | str | Path = "bhr", **reading: Any
+    motion: Any,
+    robot: Robot | str | Path = "bhr",
+    *,
+    fps: float | None = None,
+    order: str = "depth-first",
 ) -> ClipReport | list[ClipReport]:
     """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
     fall, unphysical forces, motors, joints, collisions.
@@ -153,22 +170,31 @@ def judge(
         a folder of clips.
     robot : whose motion it is, if it does not carry its own: what :meth:`Robot.load` takes. Of a
         clip with more joints than it moves, the shipped robot of the same URDF that has those.
-    reading : ``fps`` [1/s] of files that do not say, ``order`` of joints without names
-        ("depth-first" or "breadth-first").
+    fps : frame rate of files that do not say [1/s].
+    order : of joints without names, "depth-first" or "breadth-first".
     """
     from jumplab.auditing.clip import judge as judged
 
-    return judged(motion, robot, **reading)
+    return judged(motion, robot, fps=fps, order=order)
 
 
 @checked
-def mend(motion: Any, robot: Robot | str | Path = "bhr", **options: Any) -> Mended:
+def mend(
+    motion: Any,
+    robot: Robot | str | Path = "bhr",
+    *,
+    fps: float | None = None,
+    order: str = "depth-first",
+    weights: Mapping[str, float] | None = None,
+    limits: Limits | Mapping[str, Any] | None = None,
+) -> Mended:
     """The nearest motion to a clip that the robot can do: the clip's contacts, all limits hard.
 
     Parameters
     ----------
-    motion, robot : as of :func:`judge`, one clip, or what that returned of it.
-    options : ``fps``, ``order`` as there; ``weights``, ``limits`` as of :class:`jumplab.Planner`.
+    motion : one clip, as of :func:`judge`, or what that returned of it.
+    robot, fps, order : as there.
+    weights, limits : as of :class:`jumplab.Planner`.
 
     Returns
     -------
@@ -182,29 +208,60 @@ def mend(motion: Any, robot: Robot | str | Path = "bhr", **options: Any) -> Mend
     """
     from jumplab.studies.mend import mend as mended
 
-    return mended(motion, robot, **options)
+    return mended(motion, robot, fps=fps, order=order, weights=weights, limits=limits)
 
 
 @checked
-def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
+def simulate(
+    plan: JumpPlan,
+    *,
+    mode: str = "position",
+    engine: str | None = None,
+    contact: Any = "hard",
+    perturbation: Perturbation | None = None,
+    scene: Scene | None = None,
+    feedback: bool | None = None,
+    reaim: bool = False,
+    step: bool = False,
+    landing: str = "planned",
+    stand_s: float = STAND_S,
+) -> SimulationResult:
     """Play a plan on a simulated robot, catch it, and watch it stand.
 
     Parameters
     ----------
-    options : as of :func:`jumplab.sim.simulate_jump`: ``mode``, ``perturbation``, ``scene`` (by
-        default the ground that the plan was made for), ``feedback``, ``reaim``, ``step``,
-        ``landing``, ``stand_s``, ``engine`` ("bullet" or "mujoco"), ``contact`` ("hard" or
-        "usual").
+    mode : what drives track until touchdown: "position", "pd" or "whole-body" (notebook 05).
+    engine : "bullet" or "mujoco"; the default is the first that is installed.
+    contact : "hard", as plans assume, or "usual", the engine's own defaults.
+    perturbation : how the robot differs from its model; None simulates it as planned.
+    scene : the ground; None is the one that the plan was made for.
+    feedback : whether the launch corrects CoM and angular momentum; None: where one foot carries.
+    reaim : whether the legs turn in the air to where they can catch the robot.
+    step : whether a foot may step once if the robot would come to rest beyond both soles.
+    landing : "planned" or "spring", what the landing controller follows.
+    stand_s : how long to watch after the last touchdown [s]; less than the default is no landing.
 
     Returns
     -------
     SimulationResult
         Also of a jump that fails: see its ``landed`` and ``reason``.
     """
-    from jumplab.sim import Scene, simulate_jump
+    from jumplab.sim import DEFAULT_ENGINE, Scene, simulate_jump
 
-    options.setdefault("scene", Scene.of_plan(plan.summary, plan.robot))
-    run = simulate_jump(plan.tape, plan.robot, **options)
+    run = simulate_jump(
+        plan.tape,
+        plan.robot,
+        perturbation=perturbation,
+        scene=scene or Scene.of_plan(plan.summary, plan.robot),
+        stand_s=stand_s,
+        engine=engine or DEFAULT_ENGINE,
+        contact=contact,
+        mode=mode,
+        reaim=reaim,
+        step=step,
+        feedback=feedback,
+        landing=landing,
+    )
     plan.landings.append(run.landed)
     return run
 

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import json
 import re
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 from paper import tuning, worlds
 
+import jumplab as jl
 from jumplab.auditing.report import LIMITS
 from jumplab.cli import main as command_line
 from jumplab.cli import notebooks
@@ -233,6 +235,8 @@ def prose():
                 yield from ((f"{path.name}[{number}] code", text) for text in texts)
     yield "README.md", README
     yield from ((f"{name}.md", page) for name, page in PAGES.items())
+    for owner in (jl, jl.plots):
+        yield from ((f"{name}'s help", inspect.getdoc(getattr(owner, name)) or "") for name in owner.__all__)
     yield "options.toml", (ROOT / "jumplab" / "cli" / "options.toml").read_text(encoding="utf-8")
     for path in MODULES:
         yield from ((short(path), text) for text in texts_of(path.read_text(encoding="utf-8"), sentences=True))
@@ -267,12 +271,36 @@ def test_plans_pass_the_audit_and_are_not_called_clean():
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name[:2])
-def test_a_notebook_begins_with_its_purpose_and_says_when_its_comments_hold(path):
-    """A title, then prose of at most 120 words before the list; comments that hold for a default say so in one way."""
+def test_a_notebook_begins_with_its_result_and_says_when_its_comments_hold(path):
+    """A title and the result, in at most 170 words; comments that hold for a default say so in one way."""
     first = "".join(json.loads(path.read_text(encoding="utf-8"))["cells"][0]["source"])
-    before, _, after = first.partition("**In this notebook we**")
-    assert before.startswith("# ") and after.count("\n- ") >= 4
-    assert "default target" not in after or "The text comments on results for the default" in after
+    assert first.startswith("# ") and "**Result.**" in first and len(first.split()) <= 170
+    assert "default target" not in first or "The text comments on results for the default" in first
+
+
+def reading(path):
+    """(words, looks) of a notebook as it opens: what stands below a collapsed heading, and cells that are folded whole,
+    do not count; a look is a cell whose code or output is in sight.
+    """
+    words = looks = 0
+    closed = 9  # level of the collapsed heading above
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        source, data = "".join(cell["source"]), cell["metadata"]
+        if cell["cell_type"] == "markdown":
+            level = len(source) - len(source.lstrip("#")) or 9
+            closed = 9 if level <= closed < 9 else closed
+            words += len(source.split()) * (closed == 9)
+            closed = level if data.get("jp-MarkdownHeadingCollapsed") and closed == 9 else closed
+        elif closed == 9:
+            folded = data.get("jupyter", {})
+            looks += not (folded.get("source_hidden") and folded.get("outputs_hidden"))
+    return words, looks
+
+
+def test_notebooks_are_short():
+    """At 200 words and one look a minute: the first in five minutes, none in more than twenty, all in three hours."""
+    minutes = {path.name[:2]: words / 200 + looks for path in NOTEBOOKS for words, looks in (reading(path),)}
+    assert minutes["00"] <= 5 and max(minutes.values()) <= 20 and sum(minutes.values()) <= 180, minutes
 
 
 def test_patterns_of_words_find_what_they_are_for():

@@ -257,6 +257,7 @@ def test_flips_by_three_steps_have_no_stage_2():
     assert plan.srmp is not None and plan.joints is None
     assert [row.stage[0] for row in plan.statistics[:2]] == ["1", "3"]
     assert passport.audit(plan.tape, plan.robot, plan.task).passed
+    assert "three-step without stage 2" in plan.line()
     L = float(np.ravel(plan.tape.extra["planar_L"])[-1])
     assert abs(L / plan.srmp.launch.L[-1] - 1) <= Limits().of_flip().momentum_share + 0.01
     with pytest.raises(InputError, match="flips have no stage 2; leave out all that is changed of 'joint qp'"):

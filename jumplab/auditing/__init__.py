@@ -1,4 +1,4 @@
-"""Independent audit of a finished plan: a second code path that shares nothing with the planner but
+"""Independent audit of a finished plan: an implementation that shares nothing with the planner but
 robot and tape.
 
 In comes a tape with its robot, out goes an :class:`AuditReport`. Start reading at :func:`audit`;

@@ -71,9 +71,9 @@ def plan(args: Namespace) -> None:
         ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     else:
         without(args, "says what --robust allows for, which is not given", disturb=[])
-    options = given(jl.plan, args, task=task, robust=ranges)
+    options = given(jl.plan, args, task=task, robust=ranges, atlas=atlas)
     with warnings.catch_warnings(action="ignore"):  # the audit is told below
-        plan = jl.plan(**options, atlas=atlas)
+        plan = jl.plan(**options)
     report = jl.save(args.out, plan)
     args.found |= {"out": args.out, "plan": plan.summary, "audit": _audited(report)}
     print_summary(plan.summary)
@@ -84,7 +84,7 @@ def plan(args: Namespace) -> None:
 
 
 def audit(args: Namespace) -> None:
-    """Check a plan by a second code path."""
+    """Check a plan by an independent implementation."""
     from jumplab.auditing import write_audit
 
     io.folder.read_plan(args.dir)  # refuses a damaged folder

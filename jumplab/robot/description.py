@@ -353,7 +353,7 @@ class Robot(Shown):
     @cached_property
     def limits(self) -> MotorLimits:
         """Ranges and motors of the joints (nv - 6 rows), in Pinocchio's order; from the URDF, and
-        from the TOML what no URDF tells.
+        from the TOML for what a URDF cannot hold.
 
         Without numbers of its own a motor's no-load speed is its speed limit, and armature,
         friction and damping are zero.

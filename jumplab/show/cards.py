@@ -153,7 +153,7 @@ def _of_clip(report: ClipReport) -> Card:
 
 @themed
 def clip_sheet(report: ClipReport) -> Figure:
-    """What a judged clip does over time; shaded where no foot carries."""
+    """A judged clip over time; shaded where no foot carries."""
     fig = new_figure(PAGE_IN, 4.2)
     axes = fig.subplots(len(report.series), 1, sharex=True)
     for ax, (label, values) in zip(axes, report.series.items(), strict=True):
@@ -195,7 +195,7 @@ def _of_prices(prices: Prices) -> Card:
 
 @themed
 def price_bars(prices: Prices) -> Figure:
-    """What one per cent more of each limit (a degree, 0.01 of friction) buys, with the records that
+    """Gain from one per cent more of each limit (a degree, 0.01 of friction), with the records that
     check it; hollow where other limits take over.
     """
     rows = prices.rows[:MOST_PRICES][::-1]

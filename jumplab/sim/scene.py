@@ -173,7 +173,7 @@ class Scene:
         return out
 
     def within(self, x_from: float, x_to: float, half_width: float) -> Scene:
-        """What of the ground lies between these places [m] along the jump, for pictures."""
+        """The ground between these places [m] along the jump, for pictures."""
         kept = []
         for b in self.blocks:
             x = np.clip([b.x_from, b.x_to], x_from, x_to).tolist()

@@ -46,8 +46,7 @@ class JumpPlan(Shown, Named):
 
     Attributes
     ----------
-    task, robot, method : what was asked, of whom (under the task's gravity), and how it was
-        planned.
+    task, robot, method : the target, the robot under its gravity, and how it was planned.
     tape : the 1 kHz tape of the full robot.
     summary : what ``summary.json`` says: target, results, cost of the stages; plain types.
     srmp, joints : results of stages 1 and 2 (None for the direct planner; re-plans and flips have
@@ -114,21 +113,22 @@ class JumpPlan(Shown, Named):
         if self.task.rotation_rad:
             jump += f", turned by {round(math.degrees(self.task.rotation_rad))} deg"
         jump += f", rise {self.planned_rise_m:.2f} m"
-        words = f"{self.robot.name}, {jump}, {self.method}, {float(self.tape.t[-1]):.2f} s"
+        how = self.method + " without stage 2" * (self.srmp is not None and self.joints is None)
+        words = f"{self.robot.name}, {jump}, {how}, {float(self.tape.t[-1]):.2f} s"
         if "audit" not in vars(self) or (self.audit.sound and all(self.landings)):
             return words
         return f"{words}; {self.verdict}"
 
     @cached_property
     def audit(self) -> AuditReport:
-        """What the audit says of it, made when it is first asked for; see :func:`jumplab.audit`."""
+        """Its audit, made when it is first asked for; see :func:`jumplab.audit`."""
         from jumplab.auditing import audit
 
         return audit(self.tape, self.robot, self.task, edge_m=self.summary["platform_edge_m"])
 
     @property
     def verdict(self) -> str:
-        """What the audit says, and in how many of its simulations it has not landed."""
+        """The audit's verdict, and in how many of its simulations it has not landed."""
         words = self.audit.line()
         if self.landings:
             words += f"; not landed in {self.landings.count(False)} of {len(self.landings)} tries"
@@ -207,7 +207,7 @@ class JumpPlan(Shown, Named):
 
     @property
     def solvers(self) -> dict[str, dict]:
-        """What the solvers said: stage -> status, iterations, size, cost, worst re-evaluated
+        """Reports of the solvers: stage -> status, iterations, size, cost, worst re-evaluated
         residual (scaled).
         """
         return self.summary["manifest"]["solvers"]

@@ -62,7 +62,7 @@ class Planner(Shown):
     """All stages for one robot, built on first use and kept for further targets.
 
     Whatever is changed here holds in every solve of every path: every start, finer meshes,
-    re-plans, flips, the direct planner, chains. What would be ignored is refused.
+    re-plans, flips, the direct planner, chains. Changes that no stage would use are refused.
 
     Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over
     those too.

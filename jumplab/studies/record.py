@@ -8,7 +8,7 @@ from several easy jumps: a record is what it found "at least".
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -20,12 +20,12 @@ from jumplab.auditing import AuditReport
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
-from jumplab.ocp.problem import Phase
+from jumplab.ocp.problem import Phase, Term
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Limits, bounds
+from jumplab.stages.whole_body import Limits, Mesh, bounds
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.problem import SOUGHT
 from jumplab.stages.whole_body.program import Program, Solved
@@ -188,7 +188,11 @@ def record(
     *,
     share: float = 0.95,
     engines: Sequence[str] = INSTALLED,
-    **changes: Any,
+    terms: Mapping[str, Iterable[Term]] | None = None,
+    weights: Mapping[str, float] | None = None,
+    off: Iterable[str] = (),
+    limits: Limits | Mapping[str, Any] | None = None,
+    mesh: Mesh | Mapping[str, int] | None = None,
 ) -> Record:
     """The largest ``what`` of a target that a plan was found for, and what ends it.
 
@@ -201,7 +205,7 @@ def record(
     share : of the record, of the plan that is played first; a smaller one follows where a robot
         falls.
     engines : in which it is played; none with ().
-    changes : own ``limits``, ``mesh``, ``weights`` and so on, as of :class:`jumplab.Planner`.
+    terms, weights, off, limits, mesh : as of :class:`jumplab.Planner`.
 
     Raises
     ------
@@ -218,6 +222,7 @@ def record(
     for engine in engines:
         if engine not in ENGINES:
             raise InputError(f"engine {quoted(engine)}: choose of {', '.join(ENGINES)}, or none")
+    changes = dict(terms=terms, weights=weights, off=off, limits=limits, mesh=mesh)
     planner = Planner(robot, keep=True, **changes)
     with unexplained():
         search = _Search(planner, what, given)
@@ -227,7 +232,7 @@ def record(
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
     bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
-    if given is None and not changes:
+    if given is None and not any(changes.values()):
         keep_record(robot, what, value)
     made = plan, plan.audit, found, ends, share, runs
     asked = {"given": given, "share": share, "engines": engines, **changes}

@@ -542,21 +542,20 @@ def _lines(path: Path) -> list[str]:
     """Rows of the table under :data:`HEADING`, without its head."""
     try:
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-        sources = ["".join(c["source"]) for c in cells if c["cell_type"] == "markdown"]
+        source = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
     except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as e:
         raise InputError(f"{path}: not a readable notebook ({type(e).__name__}); restore it") from e
-    for source in sources:
-        before, found, after = source.partition(HEADING)
-        if found and (not before or before.endswith("\n")):
-            lines = [line.strip() for line in after.split("\n## ")[0].splitlines() if line.strip().startswith("|")]
-            head = [c.strip() for c in lines[0].strip("|").split("|")] if lines else []
-            if lines and tuple(head) != READINGS:
-                raise InputError(
-                    f"{path.name}: its differences from the paper have the columns {', '.join(head)}; "
-                    f"they must be {', '.join(READINGS)}"
-                )
-            return lines[2:]
-    return []
+    before, found, after = source.partition(HEADING)
+    if not found or (before and not before.endswith("\n")):
+        return []
+    lines = [line.strip() for line in after.split("\n## ")[0].splitlines() if line.strip().startswith("|")]
+    head = [c.strip() for c in lines[0].strip("|").split("|")] if lines else []
+    if lines and tuple(head) != READINGS:
+        raise InputError(
+            f"{path.name}: its differences from the paper have the columns {', '.join(head)}; "
+            f"they must be {', '.join(READINGS)}"
+        )
+    return lines[2:]
 
 
 def readings_markdown(rows: Iterable[dict[str, str]]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
 from jumplab.io.tape import Tape
@@ -117,6 +117,10 @@ def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure
     for row, shift, phase, frame in zip(rows, shifts, phases, outlines, strict=True):
         trunk = np.vstack([o for part, o in frame if part == "trunk"])
         x, z = trunk[np.argmax(trunk[:, 1])]
+        if phase == "launch" and shift == 0:  # its outline shows through a robot that lands in front of it
+            edge = dict(facecolor="none", edgecolor=shade(LAUNCH, 0.55), linewidth=0.7, zorder=5)
+            for _, outline in frame:
+                ax.add_patch(Polygon(outline, closed=True, **edge))
         look = dict(fontsize=7, color=shade(PHASE_COLORS[phase], 0.8), zorder=6, path_effects=[halo])
         side = LABEL_SIDES[phase] if shift == 0 else "center"
         ax.text(x, z + 0.02, f"{result.t[row]:.2f} s", ha=side, va="bottom", **look)
@@ -238,7 +242,8 @@ def engines_compared(runs: Mapping[str, SimulationResult], tape: Tape, robot: Ro
         seen, step = run.t <= tape.t[-1] + STANDING_UP_S, float(run.t[1] - run.t[0])
         force = smooth(run.foot_wrench[:, :, 2].sum(axis=1), step) / 1000
         curves = run.com[:, 2], np.degrees(trunk_pitch(run.q)), force
-        with_plan = run.t < tape.t[-1] - SMOOTHING_S  # before the impact
+        # before the impact, and from where the first mean is whole: an engine has no force in its first step
+        with_plan = (run.t > 2 * SMOOTHING_S) & (run.t < tape.t[-1] - SMOOTHING_S)
         for column, y, plan, size in zip(axes.T, curves, planned, (1e3, 1.0, 1.0), strict=True):
             column[0].plot(run.t[seen], y[seen], style, color=color, label=name)
             gap = y[with_plan] - np.interp(run.t[with_plan], tape.t, plan)

@@ -23,7 +23,7 @@ from scipy.stats import qmc
 from jumplab.auditing.audit import audit
 from jumplab.errors import JumplabError, SolverError
 from jumplab.robot import Robot
-from jumplab.show.style import PAGE_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
+from jumplab.show.style import INK, PAGE_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.plan import make_tape
 from jumplab.stages.planner import METHODS, STEPS_S, Planner, motion_of_joints
@@ -203,20 +203,23 @@ def compared(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Success of both methods by kind of cases, and the ratios of time and effort of every case that both solve."""
+    """Failures of both methods by kind of cases, and the ratios of time and effort of every case that both solve."""
     fig = new_figure(PAGE_IN, 2.4)
     axes, table = fig.subplots(1, 3, sharey=True), compared(rows)[:-1]
     for y, row in enumerate(table):
         pairs = _pairs(rows, row["cases"])
         for k, (method, color) in enumerate(zip(METHODS, (PURPLE, VERMILION), strict=True)):
-            share = row[f"{method}, clean"] / row["number"]
-            axes[0].barh(y + 0.36 * (k - 0.5), 100 * share, height=0.32, color=color)
+            place, failed = y + 0.36 * (k - 0.5), row["number"] - row[f"{method}, clean"]
+            axes[0].barh(place, failed, height=0.32, color=color)
+            axes[0].text(failed + 0.2, place, f"{failed} of {row['number']}", va="center", fontsize=6.5)
         for ax, key in zip(axes[1:], ("cpu_s", "effort"), strict=True):
             found = _ratios(pairs, key)
             ax.plot(found, y + np.linspace(-0.3, 0.3, len(found)), ".", color=PURPLE, markersize=2)
-            ax.plot(np.median(found), y, "|", color=VERMILION, markersize=16)
+            ax.plot(np.median(found), y, "|", color=INK, markersize=16, zorder=3)
     axes[0].set(yticks=range(len(table)), yticklabels=[row["cases"] for row in table])
-    axes[0].set(xlabel="clean plans [%]", xlim=(0, 100))
+    axes[0].set(xlabel="cases without a plan that passes")
+    axes[0].margins(x=0.3)
+    axes[0].grid(False)
     axes[0].invert_yaxis()
     legend_above(fig, [Patch(color=c, label=m) for m, c in zip(METHODS, (PURPLE, VERMILION), strict=True)])
     for ax, what in zip(axes[1:], ("CPU time", "effort"), strict=True):
@@ -226,6 +229,7 @@ def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
             xscale="log", xlabel=f"{what}, three steps / direct", xticks=ticks, xticklabels=[f"{x:g}" for x in ticks]
         )
         ax.minorticks_off()
+        ax.margins(x=0.05)
     return fig
 
 

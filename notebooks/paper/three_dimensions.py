@@ -165,18 +165,21 @@ def perturbed(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def maps(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    """Targets to the side and with a turn: how much of the limit used most, and which that is."""
+    """Targets to the side and with a turn: cost of the plan as a multiple of the least there, and the limit used most."""
     fig = new_figure(PAGE_IN, 3.1)
     axes = fig.subplots(1, 2)
     for ax, kind, (i, j), ticks in zip(
         axes, ("side", "turn"), ((0, 1), (3, 2)), ((AHEAD, SIDE), (YAW_DEG, RISE)), strict=True
     ):
         size = [t[1] - t[0] for t in ticks]
+        least = min(r["cost"] for r in found[kind] if r["clean"])
         for r in found[kind]:
             place = np.array([r["target"][i], r["target"][j]])
-            color = tint(LANDING, 0.15 + 0.6 * min(r["share"], 1.0) ** 3) if r["clean"] else (0.82, 0.82, 0.82)
+            dear = r["cost"] / least if r["clean"] else None
+            color = tint(LANDING, min(0.1 + 0.25 * (dear - 1), 0.8)) if r["clean"] else (0.82, 0.82, 0.82)
             ax.add_patch(Rectangle(place - np.array(size) / 2, *size, facecolor=color, edgecolor="white"))
-            said = f"{r['limiting'].replace(' ', chr(10), 1)}\n{100 * r['share']:.0f} %" if r["clean"] else "none"
+            words = r.get("limiting", "").replace(" pitch", "").replace(" ", "\n", 1)
+            said = f"{dear:.1f}\n{words}\n{100 * r['share']:.0f} %" if r["clean"] else "no plan"
             ax.text(*place, said, ha="center", va="center", fontsize=6.5)
         x, y = ((min(t) - d / 2, max(t) + d / 2) for t, d in zip(ticks, size, strict=True))
         ax.set(xlim=x, ylim=y, xticks=ticks[0], yticks=ticks[1])

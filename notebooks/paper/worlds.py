@@ -4,9 +4,11 @@ on the contacts, friction and motors that nobody planned for.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import fields
 from itertools import chain, product
 from operator import itemgetter
 from pathlib import Path
@@ -221,6 +223,18 @@ def side_by_side(ways: dict[str, MarginReport]) -> list[dict[str, Any]]:
     }
     names, columns = (list(dict.fromkeys(x)) for x in zip(*found, strict=True))
     return [{"disturbance": name} | {c: found.get((name, c), "") for c in columns} for name in names]
+
+
+def in_words(disturbance: str) -> str:
+    """A disturbance, or a pair "A+B", each with the largest size that is tried."""
+    limits = {f.name: f.metadata for f in fields(Ranges)}
+    parts = []
+    for name in disturbance.split("+"):
+        unit = limits[name]["unit"] or "times" * (name == "sensors")
+        size = limits[name]["most"] * {"%": 100, "m": 1000}.get(unit[:1] if unit != "kg m^2" else "", 1)
+        word = re.sub(r"_(kg|m|s|n_s|deg)$", "", name).replace("_", " ").replace("com", "links' CoM")
+        parts.append(f"{word} {size:g} {unit.split(' per')[0].removesuffix(' late')}".rstrip())
+    return " + ".join(parts)
 
 
 def moved(usual: MarginReport, other: MarginReport) -> list[dict[str, Any]]:
