@@ -19,7 +19,7 @@ import numpy as np
 
 from jumplab import reading
 from jumplab.arguments import checked
-from jumplab.errors import InputError, SolverError, require_type
+from jumplab.errors import InputError, SolverError
 from jumplab.io.files import locked, made, write_file
 from jumplab.ocp.cache import fingerprint
 from jumplab.ocp.derivatives import parts
@@ -112,7 +112,6 @@ class Atlas:
             If the grid is empty, not rising or too large, or ``folder`` holds an atlas of something
             else.
         """
-        require_type(robot, Robot, "the robot of the atlas")
         distances = _axis("distances", distances)
         heights = _axis("heights", heights)
         if len(distances) * len(heights) > MAX_CELLS:

@@ -20,7 +20,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from jumplab.errors import InputError, require_type
+from jumplab.arguments import checked
+from jumplab.errors import InputError
 from jumplab.models.spatial import SpatialModel, cross
 from jumplab.ocp import Term
 from jumplab.robot import Robot
@@ -45,6 +46,7 @@ MOVING = "mass", "com_m", "inertia", "payload_kg"  # what makes sampled robots d
 LIMITING = "friction", "torque_loss", "speed_loss"  # what the planned one may use less of
 
 
+@checked
 def robust_changes(
     task: JumpTask, robot: Robot, ranges: Ranges, changes: Mapping[str, Any]
 ) -> dict[str, Any]:
@@ -59,7 +61,6 @@ def robust_changes(
 
     Raises :class:`InputError` if ``ranges`` are none, or have nothing that a plan can allow for.
     """
-    require_type(ranges, Ranges, "robust: how far robots differ")
     nothing = Ranges.none()
     if all(getattr(ranges, name) == getattr(nothing, name) for name in (*MOVING, *LIMITING)):
         raise InputError(
