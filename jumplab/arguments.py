@@ -257,9 +257,8 @@ def _array(value: Any, what: str) -> np.ndarray:
 
 def _items(value: Any, what: str) -> Iterable:
     """Entries of what is a sequence; a text or a mapping is none."""
-    if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
-        raise InputError(f"{what} must be a sequence, got {quoted(value)}")
-    if _is(value, "ndarray") and value.ndim == 0:
+    whole = isinstance(value, str | bytes | Mapping) or getattr(value, "ndim", 1) == 0
+    if whole or not isinstance(value, Iterable):
         raise InputError(f"{what} must be a sequence, got {quoted(value)}")
     return value
 

@@ -31,7 +31,8 @@ from jumplab.studies.chain import Course
 from jumplab.studies.trials import TrialSettings
 
 Row = dict[str, str]
-LONGEST_S, MOST_CHARACTERS = 4, 300  # processor time of a call, after which it counts as accepted; of a message
+LONGEST_S = 4  # processor time of a call, after which it counts as taken
+MEMORY_BYTES, MOST_CHARACTERS = 4 << 30, 300  # of the process; of a message
 MORE = [float("nan"), float("inf"), -1.0, -3, True, [], (), "left", "\0", Path("/dev/null"), np.zeros(0), np.float32(2),
         np.zeros((3, 3, 3)), 1.5, 10**9, 0, np.nan * np.zeros(3), {"a": {"b": 1}}, {1: 2}, [None], b""]  # fmt: skip
 # functions that may take long if the argument is not wrong after all: a process each
@@ -76,7 +77,8 @@ def forked(work: Callable[[], Row], folder: Path) -> Row:
 
 # wrong calls --------------------------------------------------------------------------------------------------------
 def calls(folder: Path) -> Callable:
-    """One wrong argument, options included: refused in a sentence, or taken; nothing else."""
+    """One wrong argument, options included: refused in a sentence, or taken; nothing else, in little memory."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     plan, run = jl.load(good(folder) / "jump")
     robot, tape = plan.robot, plan.tape
     functions = public(robot, slow=True)

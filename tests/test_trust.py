@@ -19,6 +19,7 @@ import numpy as np
 import psutil
 import pytest
 from test_store import make_summary, make_tape
+from test_urdf_checks import TEXTS
 from together import together
 
 import jumplab as jl
@@ -165,7 +166,7 @@ def test_no_link_below_a_result_folder_is_followed(bhr, tmp_path, name):
         assert [p.name for p in foreign.iterdir()] == ["mine"]
 
 
-@pytest.mark.parametrize("how", ["folder", "file", "link"])
+@pytest.mark.parametrize("how", ["folder", "file", "link", "owner"])
 def test_a_cache_that_others_can_write_is_not_read(tmp_path, monkeypatch, how):
     """Unserialising a function may load a library that it names."""
     place = tmp_path / "cache"
@@ -180,10 +181,12 @@ def test_a_cache_that_others_can_write_is_not_read(tmp_path, monkeypatch, how):
     if how == "link":
         path.rename(tmp_path / "other")
         path.symlink_to(tmp_path / "other")
+    elif how == "owner":
+        monkeypatch.setattr(os, "geteuid", lambda: place.stat().st_uid + 1)
     else:
         (place if how == "folder" else path).chmod(0o777)
     assert kept(3) == 3
-    if how != "folder":  # it was replaced
+    if how in ("file", "link"):  # it was replaced
         assert kept(4) == 3 and path.stat().st_mode & 0o777 == 0o600
 
 
@@ -373,6 +376,14 @@ def test_wrong_calls_are_refused_in_a_sentence(bhr, tmp_path):
 
 def test_whether_a_folder_can_be_made_is_seen_without_making_it(tmp_path):
     assert ensure_writable(tmp_path / "a" / "b") == tmp_path / "a" / "b" and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("text", [text for _, text, _ in TEXTS], ids=[name for name, _, _ in TEXTS])
+def test_a_pair_of_texts_is_refused_as_a_urdf_is(bhr, text):
+    """Without [source], and without a file, the faults of a URDF are the same."""
+    with pytest.raises(InputError) as told:
+        jl.Robot.from_text(text, bhr.config_text)
+    assert len(str(told.value)) <= 300 and "\n" not in str(told.value)
 
 
 def test_a_pair_of_texts_is_checked_as_a_urdf_is(bhr, tmp_path):

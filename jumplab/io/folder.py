@@ -28,7 +28,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from jumplab import reading
-from jumplab.errors import InputError, as_path, require_type
+from jumplab.arguments import checked
+from jumplab.errors import InputError, as_path
 from jumplab.io.files import ensure_writable as ensure_writable
 from jumplab.io.files import locked, made, settle
 from jumplab.io.files import write_file as write_file
@@ -163,6 +164,7 @@ def sha256(path: Path) -> str:
     return hashlib.sha256(reading.content(path, "arrays", link=False)).hexdigest()
 
 
+@checked
 def write_plan(
     folder: str | Path,
     tape: Tape,
@@ -176,9 +178,6 @@ def write_plan(
     files. ``complete`` is called with the folder before anybody else sees it, to add files to it
     (``write_audit``); what it returns is returned.
     """
-    require_type(tape, Tape, "the tape to write")
-    require_type(robot, Robot, "its robot")
-    require_type(summary, Mapping, "the summary")
     with transaction(folder) as staging:
         tape.save(staging / PLAN)
         (staging / URDF).write_bytes(robot.urdf.encode())
@@ -194,13 +193,13 @@ def write_plan(
         return complete(staging) if complete else None
 
 
+@checked
 def write_simulation(folder: str | Path, result: Any, summary: Summary) -> None:
     """Write a simulation (two files, by its ``save``) beside the plan that ``summary`` was read
     with.
 
     Raises :class:`InputError` if the folder cannot be written, or has come to hold another plan.
     """
-    require_type(summary, Mapping, "the summary")
     if not {"planned_distance_m", "planned_rise_m", "manifest"} <= set(summary):
         raise InputError(
             "the summary is not one that a plan was read with; take it from store.read_plan"

@@ -187,7 +187,7 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
         try:
             lines += ax.plot(t[rows], y[rows], **look)
         except (AttributeError, TypeError, ValueError) as e:
-            raise InputError(f"no line can be drawn with {quoted(kwargs)}: {quoted(e)}") from e
+            raise InputError(f"no line can look like {quoted(kwargs)}: {quoted(e)}") from None
     return lines
 
 

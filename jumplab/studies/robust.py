@@ -20,6 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.models.spatial import SpatialModel, cross
 from jumplab.ocp import Term
@@ -45,6 +46,7 @@ MOVING = "mass", "com_m", "inertia", "payload_kg"  # what makes sampled robots d
 LIMITING = "friction", "torque_loss", "speed_loss"  # what the planned one may use less of
 
 
+@checked
 def robust_changes(
     task: JumpTask, robot: Robot, ranges: Ranges, changes: Mapping[str, Any]
 ) -> dict[str, Any]:

@@ -35,7 +35,9 @@ PACKAGE = Path(__file__).parent.parent
 DECIDING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet", "mujoco")
 SHOWING = ("show", "cli", "api.py", "__main__.py", "notebooks")  # what decides no result
 ANSWER_S = 10  # in which a cluster answers, or has none
-SAFE_PATH = "PYTHONSAFEPATH"
+# of processes that are started: they import nothing from the current folder, and the one of joblib
+# that tidies up behind a command which was told to stop is silent
+SILENT_AND_SAFE = {"PYTHONSAFEPATH": "1", "PYTHONWARNINGS": "ignore:resource_tracker"}
 _CLUSTER: list[Any] = []  # client of the cluster that does the work, see on_cluster
 _POOL = threading.RLock()  # joblib's processes are one pool, which threads use in turn
 Task = tuple[Callable, tuple, dict]  # as :func:`joblib.delayed` makes it
@@ -186,7 +188,7 @@ def in_parallel(
         yield from map(_done, work)
         return
     begin = {"initializer": _serve, "initargs": (os.getpid(),)}
-    with _POOL, _safe_path():
+    with _POOL, _environment():
         try:
             yield from joblib.Parallel(jobs, return_as=order, max_nbytes=None, **begin)(work)
         except BrokenProcessPool as e:
@@ -197,17 +199,16 @@ def in_parallel(
 
 
 @contextmanager
-def _safe_path() -> Iterator[None]:
-    """Within the block, a Python that is started imports nothing from its current folder."""
-    before = os.environ.get(SAFE_PATH)
-    os.environ[SAFE_PATH] = "1"
+def _environment() -> Iterator[None]:
+    """Within the block, processes are started as :data:`SILENT_AND_SAFE` has it."""
+    before = {name: os.environ.get(name) for name in SILENT_AND_SAFE}
+    os.environ.update(SILENT_AND_SAFE)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[SAFE_PATH]
-        else:
-            os.environ[SAFE_PATH] = before
+        for name in SILENT_AND_SAFE:
+            del os.environ[name]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
 
 
 @contextmanager
