@@ -106,7 +106,7 @@ def check(path: str | Path, config_text: str, tree: Tree | None = None) -> Check
     return result
 
 
-def check_texts(urdf: str, config_text: str, where: str) -> None:
+def check_texts(urdf: str, config_text: str, where: str = "") -> None:
     """Refuse (:class:`RobotError`) the texts of a robot by the rules of a bare URDF: its file, and
     the limits of the joints that the configuration names.
 
