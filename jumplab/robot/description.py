@@ -116,7 +116,7 @@ class Robot(Shown):
         """
         urdf, folder, config = files_of(name_or_path)
         if config is None or "source" in read_toml(config, urdf):
-            return foreign.importer().load(name_or_path, repair)
+            return foreign.importer().examine(name_or_path, repair).robot
         text = read_text(folder / urdf)
         if name_or_path not in SHIPPED:
             foreign.importer().check_texts(text, config, urdf)
