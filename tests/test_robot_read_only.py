@@ -1,4 +1,4 @@
-"""No robot is changed by accident: neither in memory, nor by what is kept of another one."""
+"""No robot is changed by accident."""
 
 import copy
 import gc
