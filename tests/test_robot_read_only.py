@@ -1,7 +1,11 @@
-"""No robot is changed by accident."""
+"""No robot is changed by accident: neither in memory, nor by what is kept of another one."""
 
 import copy
 import gc
+import json
+import os
+import subprocess
+import sys
 import weakref
 from collections.abc import Mapping
 from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
@@ -11,6 +15,7 @@ import pinocchio as pin
 import pytest
 from fixtures_robots import alike, through_processes
 
+import jumplab as jl
 from jumplab.robot import Robot
 
 
@@ -86,3 +91,32 @@ def test_a_robot_goes_to_another_process_whole(bhr):
         assert alike(other, moon) and other == moon and other.model.gravity.linear[2] == -1.62
     assert moon.with_limits(speed=0.9).gravity == 1.62 and moon.under_gravity(9.8).model.gravity.linear[2] == -9.8
     assert moon.hash == bhr.with_stance(knee_rad=0.7).hash
+
+
+# kept between processes --------------------------------------------------------------------------------------
+PLAN = """
+import json, sys
+import jumplab as jl
+robot = jl.Robot.load("bhr")
+if sys.argv[1] == "changed":
+    robot = robot.with_limits(effort=1.5).with_mass("trunk", factor=1.2)
+plan = jl.plan(jl.JumpTask(distance_m=0.3, height_m=0.2), robot)
+print(json.dumps([robot.hash, plan.tape.q.sum().hex(), plan.tape.tau.max().hex(), plan.tape.f.max().hex()]))
+"""
+
+
+@pytest.mark.slow
+def test_a_fresh_process_after_a_change_plans_as_if_there_had_been_none(bhr, tmp_path):
+    """What is kept between processes is another robot's under another name."""
+
+    def said(which: str) -> list:
+        environment = os.environ | {"JUMPLAB_CACHE": str(tmp_path / "cache")}
+        done = subprocess.run([sys.executable, "-c", PLAN, which], env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    changed, plain = said("changed"), said("plain")
+    tape = jl.plan(jl.JumpTask(distance_m=0.3, height_m=0.2), bhr).tape  # of a process with another cache
+    assert any((tmp_path / "cache").iterdir())
+    assert plain == [bhr.hash, tape.q.sum().hex(), tape.tau.max().hex(), tape.f.max().hex()]
+    assert all(a != b for a, b in zip(plain, changed, strict=True))
