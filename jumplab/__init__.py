@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from jumplab.errors import Shown
-from jumplab.robot.foreign import register
+from jumplab.robot import foreign
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ loads what is asked for
     from jumplab import errors as errors
@@ -44,18 +44,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab.studies.trials import run_trials as run_trials
     from jumplab.task import JumpTask as JumpTask
 
-
-def _import_robot(name_or_path: Any, repair: tuple[str, ...]) -> Any:
-    """What :meth:`Robot.load` does with files of somebody else; the importer is above the core."""
-    return import_module("jumplab.robot_import.checkup").load(name_or_path, repair)
-
-
-def _check_robot(urdf: str, config_text: str, where: str) -> None:
-    """The importer's check of what is already a pair of texts."""
-    import_module("jumplab.robot_import.checkup").check_texts(urdf, config_text, where)
-
-
-register(_import_robot, _check_robot)
+foreign.importer = lambda: import_module("jumplab.robot_import.checkup")
 _PLACES = {
     "JumpTask": "task",
     "Contacts": "stages.whole_body",

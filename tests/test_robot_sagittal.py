@@ -135,7 +135,7 @@ def test_stance_at_rest_is_statics(bhr):
 
 @pytest.mark.parametrize("knee", [0.1, 0.5, 1.0, 1.6])
 def test_stance_follows_the_knee(bhr, knee):
-    angles = stance_angles(bhr, knee)
+    angles = stance_angles(bhr.with_stance(knee_rad=knee))
     assert com_from_toe(bhr, angles)[0] == pytest.approx(bhr.sagittal.sole_center[0], abs=1e-9)
     assert bhr.sagittal.joint_angles(angles)[1] == pytest.approx(knee)
 

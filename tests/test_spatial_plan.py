@@ -413,7 +413,7 @@ def test_platforms_that_would_lie_under_a_sole_are_refused():
 
 
 def test_it_begins_in_the_posture_in_which_the_robot_waits(bhr):
-    start = stance_angles(bhr, 0.6)
+    start = stance_angles(bhr.with_stance(knee_rad=0.6))
     plan = planner().plan(SIDE, "direct", start=start)
     assert plan.tape.q[0, 7:] == pytest.approx(configuration(bhr, start)[7:], abs=1e-3)
     assert plan.planned_side_m == pytest.approx(0.3, abs=2e-3) and np.abs(plan.tape.v[0]).max() < 1e-3

@@ -162,10 +162,6 @@ def _rate(x: Mapping[str, Any]) -> float | None:
     return None
 
 
-def _names(x: Mapping[str, Any]) -> tuple[str, ...] | None:
-    return tuple(str(name) for name in x["joint_names"]) if "joint_names" in x else None
-
-
 def _first_wxyz(x: np.ndarray) -> np.ndarray:
     return np.roll(x, -1, axis=-1)
 
@@ -267,12 +263,13 @@ def read_clips(
         raise InputError(f"fps = {fps:g} must lie above 0 and not above 10000")
     content = _content(path)
     found = []
-    for name, x, names in _entries(content, path.stem):
+    for name, x, form in _entries(content, path.stem):
         where = f"{path}" if name == path.stem else f"{path}, clip {name!r}"
         try:
-            form = FORMS[names]
-            raw = _of_arrays(form, x, names) if isinstance(form, str) else form(x)
-            raw = replace(raw, fps=_rate(x), names=raw.names or _names(x))
+            reader = FORMS[form]
+            raw = _of_arrays(reader, x, form) if isinstance(reader, str) else reader(x)
+            names = raw.names or tuple(map(str, x.get("joint_names", ()))) or None
+            raw = replace(raw, fps=_rate(x), names=names)
         except (KeyError, IndexError, TypeError, ValueError) as e:
             raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
         found.append(_clip(where, name, raw, robot, fps, order))

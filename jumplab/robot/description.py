@@ -116,17 +116,17 @@ class Robot(Shown):
         """
         urdf, folder, config = files_of(name_or_path)
         if config is None or "source" in read_toml(config, urdf):
-            return foreign.load(name_or_path, repair)
+            return foreign.importer().examine(name_or_path, repair).robot
         text = read_text(folder / urdf)
         if name_or_path not in SHIPPED:
-            foreign.check(text, config, urdf)
+            foreign.importer().check_texts(text, config, urdf)
         return cls(text, config)
 
     @classmethod
     @checked
     def from_text(cls, urdf: str, config_text: str) -> Robot:
         """The robot of two texts (URDF, TOML), checked as files are; raises :class:`RobotError`."""
-        foreign.check(urdf, config_text)
+        foreign.importer().check_texts(urdf, config_text)
         return cls(urdf, config_text)
 
     def __post_init__(self) -> None:
@@ -325,7 +325,7 @@ class Robot(Shown):
             return self
         lines = "".join(f"# changed: {remark}\n" for remark in remarks)
         robot = replace(self, urdf=urdf, config_text=f"{self.config_text.rstrip()}\n{lines}")
-        foreign.check(robot.urdf, robot.config_text)
+        foreign.importer().check_texts(robot.urdf, robot.config_text)
         check_stance(robot)
         return robot
 

@@ -115,10 +115,9 @@ def leg_columns(robot: Robot) -> list[np.ndarray]:
     return out
 
 
-def give_of(robot: Robot, base: float = 0.0) -> np.ndarray:
-    """How readily each column (nv,) moves: joints of legs 1, of the base ``base`` [1], others 0."""
+def give_of(robot: Robot) -> np.ndarray:
+    """How readily each column (nv,) moves: joints of legs 1, others and the base 0."""
     give = np.zeros(robot.model.nv)
-    give[:BASE] = base
     give[np.concatenate(leg_columns(robot))] = 1.0
     return give
 

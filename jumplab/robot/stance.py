@@ -30,18 +30,16 @@ def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
     return in_xz(np.exp(-1j * angles) @ robot.sagittal.mean_arms)
 
 
-def stance_angles(
-    robot: Robot, knee_rad: float | None = None, *, within_limits: bool = True
-) -> np.ndarray:
+def stance_angles(robot: Robot, *, within_limits: bool = True) -> np.ndarray:
     """Absolute link angles (5,) of the standing posture, order foot, shank, thigh, trunk, arm
     [rad].
 
-    Knee, trunk pitch and shoulder come from the robot's configuration (``knee_rad`` overrides the
-    first); the shank's lean follows from the CoM above the middle of the sole. Raises
+    Knee, trunk pitch and shoulder come from the robot's configuration; the shank's lean follows
+    from the CoM above the middle of the sole. Raises
     :class:`RobotError` if no lean does that, or, unless ``within_limits`` is off, if a joint would
     leave its range.
     """
-    knee = robot.stance["knee_rad"] if knee_rad is None else knee_rad
+    knee = robot.stance["knee_rad"]
     pitch = robot.stance["trunk_pitch_rad"]
     arm = pitch + robot.stance["shoulder_rad"]
     shank = _lean(robot, knee, pitch, arm)

@@ -106,7 +106,7 @@ def check(path: str | Path, config_text: str, tree: Tree | None = None) -> Check
     return result
 
 
-def check_texts(urdf: str, config_text: str, where: str) -> None:
+def check_texts(urdf: str, config_text: str, where: str = "") -> None:
     """Refuse (:class:`RobotError`) the texts of a robot by the rules of a bare URDF: its file, and
     the limits of the joints that the configuration names.
 
@@ -129,15 +129,12 @@ def check_texts(urdf: str, config_text: str, where: str) -> None:
 
 
 def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
-    """The checkup of a name or a path; roles are found where no table [source] tells them."""
+    """The checkup of a name or of a path, of a bare URDF or MJCF or of a TOML file; roles are found
+    where no table [source] tells them.
+    """
     urdf, folder, config = files_of(robot)
     path = locate(urdf, folder)
     if config is not None and "source" in read_toml(config, "robot configuration"):
         return check(path, config)
     first = draft(path, repair)
     return check(path, first.text, first.tree)
-
-
-def load(name_or_path: str | Path, repair: tuple[str, ...] = ()) -> Robot:
-    """The robot of a bare URDF or MJCF, or of a TOML file with a table [source]: (name or path)."""
-    return examine(name_or_path, repair).robot

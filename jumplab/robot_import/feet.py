@@ -137,9 +137,7 @@ def refuse_wheel(tree: Tree, ankle: Joint) -> None:
     if ankle.kind != "continuous" and np.abs(stops).max() <= MOST_RAD:
         return
     for part in tree.bodies[tree.carrier[ankle.child]]:
-        for place, shape in (
-            x for kind in ("collision", "visual") for x in tree.shapes(part, kind)
-        ):
+        for place, shape in tree.shapes(part) + tree.shapes(part, "visual"):
             to_joint = tree.pose[ankle.child].inverse() * tree.pose[part] * place
             if _round(tree, shape, to_joint, ankle.axis):
                 raise tree.error(

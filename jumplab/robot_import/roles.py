@@ -440,7 +440,8 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     )
     asked = ""
     faults = []
-    for joint in jumping_joints(tree, roles):
+    names = [name for pair in roles.joints.values() for name in pair]
+    for joint in dict.fromkeys(names + leg_joints(tree, roles.trunk, roles.feet)):
         given = roles.assumed.get(joint, {})
         title = f"limits.{key(joint)}"
         if parts := keys_of(wrong_limits(tree, joint, given)):
@@ -469,12 +470,6 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     )
     roles = replace(roles, notes=(*notes(tree), *dict.fromkeys(tree.notes), *roles.notes))
     return Draft(config, roles, sole, tree, tuple(faults))
-
-
-def jumping_joints(tree: Tree, roles: Roles) -> list[str]:
-    """Names of the joints that jump: with a role, and the others of the legs."""
-    names = [name for pair in roles.joints.values() for name in pair]
-    return list(dict.fromkeys(names + leg_joints(tree, roles.trunk, roles.feet)))
 
 
 def _inside(tree: Tree, left: np.ndarray, pair: tuple[str, ...], wish: float) -> float:

@@ -151,7 +151,7 @@ def _nine_links(ax, body, q):
 
 
 def _five_links(ax, robot):
-    angles, m = stance_angles(robot, 1.0), robot.sagittal
+    angles, m = stance_angles(robot.with_stance(knee_rad=1.0)), robot.sagittal
     angles = angles + np.array([0.0, 0.0, 0.0, 0.25, -0.6])
     p = draw_five_link(ax, m, angles, -m.sole_center)
     points = ("hip", "knee", "ankle", "shoulder")
