@@ -137,7 +137,7 @@ def write_folder(path, tape: Tape, **summary):
 
 def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
     write_folder(tmp_path, good)
-    write_audit(tmp_path)
+    (tmp_path / "passport.json").write_text("that of an older plan")
     files = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
 
     def interrupt(*_):
@@ -145,7 +145,7 @@ def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        write_audit(tmp_path, JumpTask(0.9, 0.5))
+        write_audit(tmp_path)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == files
 
 

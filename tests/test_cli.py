@@ -297,16 +297,11 @@ def test_real_plan_is_self_contained(planned):
     [
         ("--height-m 1.4", 3, "whole body: no plan ("),
         ("--distance-m -1.0 --method three-step", 3, "stage 2: at t = 0."),
-        ("--distance-m 9", 2, "distance = 9 m is outside -3 ... 3 m"),
-        ("--gravity 0", 2, "gravity = 0 m/s^2 is outside 0.5 ... 30 m/s^2"),
     ],
 )
 def test_real_refusals_and_their_exit_codes(capsys, here, arguments, code, sentence):
-    """The real planner: infeasible before solving, infeasible after, bad input; --debug adds the traceback to each."""
+    """The real planner: infeasible before solving, infeasible after."""
     assert one_sentence(*run(capsys, "plan", "--out", "p", *arguments.split()), code).startswith(sentence)
-    if code == 2:
-        got, _, err = run(capsys, "plan", "--out", "p", "--debug", *arguments.split())
-        assert got == code and "Traceback (most recent call last)" in err and f"\njumplab: {sentence}" in err
     assert names(here) == []
 
 

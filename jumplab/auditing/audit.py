@@ -77,26 +77,22 @@ def _checks(measures: Iterable[Measure], limits: Mapping[str, Limit] = LIMITS) -
     return [limits[name].check(*values) for name, *values in measures]
 
 
-def write_audit(
-    folder: str | Path, task: JumpTask | None = None, *, into: str | Path | None = None
-) -> AuditReport:
+def write_audit(folder: str | Path, *, into: str | Path | None = None) -> AuditReport:
     """Audit the plan in a result folder and write ``passport.json`` beside it (or into another
     folder).
 
     Reads ``plan.npz``, ``robot.urdf``, ``robot.toml`` and, for the target and the manifest,
     ``summary.json`` if it is there; takes no lock, since the folder may be one that is being
-    written. ``task`` is what was asked instead of the target in ``summary.json``. Raises
-    :class:`InputError` if a file is missing or damaged, or the folder cannot be written to.
+    written. Raises :class:`InputError` if a file is missing or damaged, or the folder cannot be
+    written to.
     """
     tell("audit")
     folder = as_path(folder, "a result folder")
     tape = Tape.load(folder / PLAN)
     humanoid = Robot.from_text(_text(folder / URDF), _text(folder / CONFIG))
     summary = read_json(folder / SUMMARY) if (folder / SUMMARY).exists() else {}
-    edge = None
-    if task is None:
-        task = _task_of(summary)
-        edge = summary.get("platform_edge_m")
+    task = _task_of(summary)
+    edge = summary.get("platform_edge_m") if task else None
     report = audit(tape, humanoid, task, edge_m=edge)
     manifest = {**report.manifest, "plan_sha256": sha256(folder / PLAN), "planner": summary}
     report = dataclasses.replace(report, manifest=manifest)

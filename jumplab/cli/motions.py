@@ -43,7 +43,7 @@ def judge(args: Namespace) -> None:
         raise InfeasibleError(f"clip {report.line()}")
 
 
-def _write(folder: Path, reports: list[Any], found: dict[str, Any]) -> None:
+def _write(folder: str, reports: list[Any], found: dict[str, Any]) -> None:
     """The reports as JSON, and of each clip a page in 3-D."""
     with io.folder.transaction(folder) as staging:
         (staging / REPORT).write_text(io.folder.to_json(found), encoding="utf-8")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -53,30 +53,24 @@ class Node:
 
 
 @checked
+@dataclass(repr=False, eq=False)
 class Atlas:
     """Plans over a grid; give it to :class:`jumplab.Planner`, whose direct plans then begin with
     it.
 
     Attributes
     ----------
+    robot : its name.
     distances, heights : the grid's values [m], rising.
     nodes : (distance, height) -> :class:`Node`, of those that have a plan.
     key : what the plans were made of: robot, terms, weights, limits, mesh.
     """
 
-    def __init__(
-        self,
-        robot: str,
-        distances: Sequence[float],
-        heights: Sequence[float],
-        nodes: Mapping,
-        key: str,
-    ):
-        self.robot = robot
-        self.key = key
-        self.nodes = dict(nodes)
-        self.distances = tuple(map(float, distances))
-        self.heights = tuple(map(float, heights))
+    robot: str
+    distances: tuple[float, ...]
+    heights: tuple[float, ...]
+    nodes: dict[tuple[float, float], Node]
+    key: str
 
     def __repr__(self) -> str:
         count = len(self.distances) * len(self.heights)

@@ -135,7 +135,7 @@ def envelope(
     work = partial(cell_row, planner)
     results = plan_rows(rows, work, known, "clean", folder, "envelope", **options)
     cells = tuple(Cell.of(*result) for result in results)
-    return Envelope(robot.name, tuple(distances), tuple(heights), cells, tuple(axes))
+    return Envelope(robot.name, distances, heights, cells, axes)
 
 
 def cell_row(planner: Planner, task: JumpTask) -> Plain:

@@ -180,8 +180,6 @@ def run(
     if tapes_hz is not None and not 1 <= tapes_hz <= 1000:
         raise InputError(f"tapes_hz = {tapes_hz:g} Hz is outside 1 ... 1000 Hz")
     _check_weights(cases)
-    for case in cases:
-        robot_of(case.robot)
     folder = ensure_writable(out)
     places = {}
     for name in dict.fromkeys(case.robot for case in cases) if atlas else ():
