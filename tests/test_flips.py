@@ -130,12 +130,12 @@ def test_tuck_forecasts_the_planned_turn_and_mends_a_wrong_one():
     assert is_flip(tape)
     L = float(np.ravel(tape.extra["planar_L"])[-1])
     row = tape.takeoff_index + 1
-    turn = tuck._left(0.0, float(tape.t[row]), float(tape.t[-1] - tape.t[row]), L)
+    turn = tuck.trunk_turn(0.0, float(tape.t[row]), float(tape.t[-1] - tape.t[row]), L)
     assert abs(turn - (trunk_angle(tape.q)[-1] - trunk_angle(tape.q)[row])) < 0.02
     at = row + 280
     now, left = float(tape.t[at]), float(tape.t[-1] - tape.t[at])
-    longer, shorter = (abs(tuck._left(size, now, left, L)) for size in (-0.03, 0.03))
-    assert longer > abs(tuck._left(0.0, now, left, L)) + 0.05 > shorter + 0.1
+    longer, shorter = (abs(tuck.trunk_turn(size, now, left, L)) for size in (-0.03, 0.03))
+    assert longer > abs(tuck.trunk_turn(0.0, now, left, L)) + 0.05 > shorter + 0.1
     shift, _ = tuck.shift(round(now * 1000), Gauge(plan.robot).motion(tape.q[at], tape.v[at]), left)
     assert abs(shift) <= 1e-3  # nothing to mend
 
@@ -147,18 +147,18 @@ def test_a_shifted_tape_never_runs_backwards(flight_s):
     tape, last = plan.tape, plan.tape.t[-1] - plan.tape.takeoff_time
     t = tape.takeoff_time + (tape.t - tape.takeoff_time) * flight_s / last
     tuck = Flight(plan.robot, replace(tape, t=np.where(tape.t < tape.takeoff_time, tape.t, t)), level)
-    _, pace, _ = tuck._pieces(tuck._sooner, tape.takeoff_time, flight_s, 32)
+    _, pace, _ = tuck.pieces(tuck.sooner_s, tape.takeoff_time, flight_s, 32)
     assert pace.min() > 0.03
-    t = np.linspace(tape.takeoff_time, tuck._end, 400)
-    there = tuck._place(-tuck._later, t, tape.takeoff_time, flight_s)
-    waits = (there == tuck._tight).sum() * (t[1] - t[0])
+    t = np.linspace(tape.takeoff_time, tuck.end_s, 400)
+    there = tuck.place(-tuck.later_s, t, tape.takeoff_time, flight_s)
+    waits = (there == tuck.tight_s).sum() * (t[1] - t[0])
     assert (
         np.diff(there).min() >= 0
-        and there[-1] == pytest.approx(tuck._end)
-        and waits == pytest.approx(tuck._later, abs=4e-3)
+        and there[-1] == pytest.approx(tuck.end_s)
+        and waits == pytest.approx(tuck.later_s, abs=4e-3)
     )
     if flight_s > 0.64:
-        assert tuck._sooner == SOONER_S
+        assert tuck.sooner_s == SOONER_S
 
 
 @pytest.mark.slow
@@ -200,7 +200,7 @@ def test_a_robust_backflip_lands_a_robot_that_turns_too_slowly():
     opening = plan.tape.t > plan.tape.t[-1] - 0.9 * LATE_SHARE * (plan.tape.t[-1] - plan.tape.takeoff_time)
     share = np.abs(plan.tape.v[opening, 6:]) / plan.robot.limits.speed
     assert share.max() < robust.OPENING_SHARE + 0.05
-    later, usual = (Flight(plan.robot, tape, level)._later for tape in (plan.tape, backflip().tape))
+    later, usual = (Flight(plan.robot, tape, level).later_s for tape in (plan.tape, backflip().tape))
     assert later > 1.3 * usual > LATER_S
     drawn = Perturbation.draw(plan.robot, TrialKey(1, 5, "", "").robot_seed)
     result = simulate_jump(plan.tape, plan.robot, mode="whole-body", perturbation=drawn, reaim=True)

@@ -68,11 +68,11 @@ def test_refusals(plan, monkeypatch):
 
 def test_a_camera_that_stands_still_sees_all_of_a_short_jump_and_follows_a_long_one(plan):
     way = movies.trace(plan.robot, plan.tape.q)
-    looks, distance = movies._camera(way, 100.0)
+    looks, distance = movies.camera(way, 100.0)
     assert np.ptp(looks, axis=0).max() == 0 and 2.0 < distance < 6.0
     far = way.joints.copy()
     far[..., 0] += np.linspace(0, 5, len(far))[:, None]
-    looks, _ = movies._camera(way._replace(joints=far), 100.0)
+    looks, _ = movies.camera(way._replace(joints=far), 100.0)
     assert np.abs(looks[:, 0] - far[:, 0, 0]).max() < 0.2 and np.ptp(looks[:, 2]) == 0
 
 

@@ -182,7 +182,7 @@ def test_drives_on_the_plan_give_its_torque(name):
     sent = servo.drive(command, q, np.zeros(robot.model.nv))
     assert sent.torque(q[7:], rate) == pytest.approx(tau, abs=1e-9)
     elsewhere = servo.drive(command, rng.uniform(-1, 1, len(q)), rng.uniform(-1, 1, robot.model.nv))
-    assert np.array_equal(elsewhere.q, sent.q) and np.array_equal(elsewhere.tau, np.zeros(n))
+    assert np.array_equal(elsewhere.q, sent.q) and not np.any(elsewhere.tau)
     off = np.zeros(n)
     off[4] = 0.01
     pulled = sent.torque(q[7:] + off, rate) - tau

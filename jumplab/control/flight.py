@@ -65,6 +65,11 @@ class Flight:
     stays as planned. A tuck that opens sooner is shifted by a sin^2 of a power of time, zero at
     :data:`FROM_SHARE` of the flight and at touchdown. One that opens later waits where it is
     tightest, and has less time to open: how long it may wait is a matter of the tape's speeds.
+
+    Attributes
+    ----------
+    end_s, tight_s : time on the tape at touchdown, and where the tuck is tightest [s].
+    sooner_s, later_s : how much sooner the tuck may open, and how long it may wait [s].
     """
 
     def __init__(self, robot: Robot, tape: Tape, ground: Callable[[float], float]):
@@ -77,8 +82,8 @@ class Flight:
         flight = tape.flights[-1]
         q = tape.q[flight]
         self._t = tape.t[flight]
-        self._end = float(tape.t[-1])
-        self.from_s = float(self._t[0] + FROM_SHARE * (self._end - self._t[0]))
+        self.end_s = float(tape.t[-1])
+        self.from_s = float(self._t[0] + FROM_SHARE * (self.end_s - self._t[0]))
         self._pitch = np.unwrap(pitch_of(q))
         # about the CoM in trunk axes: inertia, and momentum of the joints' rates alone
         level = np.hstack([np.tile(LEVEL, (len(q), 1)), q[:, 7:]])
@@ -87,9 +92,9 @@ class Flight:
         self._inertias = np.array([row.inertia for row in rows])
         self._momenta = np.array([row.momentum for row in rows])
         late = self._t >= self.from_s
-        self._tight = float(self._t[late][np.argmin(self._inertias[late, 1, 1])])
-        self._later = self._longest_wait(robot, rates[self._t >= self._tight, 6:])
-        self._sooner = min(SOONER_S, FORWARD * (self._end - self.from_s) / STEEP)
+        self.tight_s = float(self._t[late][np.argmin(self._inertias[late, 1, 1])])
+        self.later_s = self._longest_wait(robot, rates[self._t >= self.tight_s, 6:])
+        self.sooner_s = min(SOONER_S, FORWARD * (self.end_s - self.from_s) / STEEP)
         self._size = 0.0
         self._shift = 0.0
 
@@ -136,7 +141,7 @@ class Flight:
         whose ``rates`` (N, nv - 6) are those of the tape.
         """
         faster = robot.limits.speed / np.maximum(np.abs(rates), NOTHING)
-        opens = self._end - self._tight
+        opens = self.end_s - self.tight_s
         return max(min(LATER_S, opens / 2), opens * (1 - 1 / max(float(faster.min()), 1.0)))
 
     def shift(self, step: int, now: Motion, left_s: float) -> tuple[float, float]:
@@ -150,11 +155,11 @@ class Flight:
             need = self._pitch[-1] - seen - 2 * np.pi * turns
             want = self._best(t, left_s, now.momentum[1], need)
             # which moves nothing yet
-            waits = max(want, self._size) <= 0 and t + self._shift <= self._tight
+            waits = max(want, self._size) <= 0 and t + self._shift <= self.tight_s
             most = np.inf if waits else SHIFT_RATE * STEP_S
             self._size += float(np.clip(want - self._size, -most, most))
         before = self._shift
-        self._shift = float(self._place(self._size, t, t, left_s)) - t
+        self._shift = float(self.place(self._size, t, t, left_s)) - t
         return self._shift, (self._shift - before) / STEP_S
 
     def _clock(self, step: int, left_s: float) -> tuple[float, float]:
@@ -162,7 +167,7 @@ class Flight:
         it should land.
         """
         t = step * STEP_S
-        return t, left_s if np.isfinite(left_s) else max(self._end - t, STEP_S)
+        return t, left_s if np.isfinite(left_s) else max(self.end_s - t, STEP_S)
 
     def turn_ahead(self, step: int, now: Motion, left_s: float) -> np.ndarray:
         """How far (3, 3) the trunk will be turned off its planned attitude at touchdown, about all
@@ -174,7 +179,7 @@ class Flight:
         attitude = rotation(now.q[3:7])
         t, left_s = self._clock(step, left_s)
         if left_s > STEP_S:
-            middle, pace, dt = self._pieces(self._size, t, left_s, TURNS)
+            middle, pace, dt = self.pieces(self._size, t, left_s, TURNS)
             rows = np.interp(middle, self._t, np.arange(len(self._t)))
             for row, faster in zip(rows, pace, strict=True):
                 inertia = between(self._inertias, row)
@@ -188,43 +193,46 @@ class Flight:
 
     def _best(self, t: float, left_s: float, momentum: float, need: float) -> float:
         """The shift with which the trunk turns by ``need`` [rad], or the nearest one."""
-        low = -self._later
-        high = self._sooner
-        way = np.sign(self._left(low, t, left_s, momentum) - self._left(high, t, left_s, momentum))
+        low = -self.later_s
+        high = self.sooner_s
+        first, last = (self.trunk_turn(size, t, left_s, momentum) for size in (low, high))
+        way = np.sign(first - last)
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
-            if way * (self._left(middle, t, left_s, momentum) - need) > 0:
+            if way * (self.trunk_turn(middle, t, left_s, momentum) - need) > 0:
                 low = middle
             else:
                 high = middle
         return (low + high) / 2
 
-    def _place(self, size: float, t, now: float, left_s: float):
-        """Time on the tape at real times ``t``: the rest of it in the time that is left, shifted or
-        held up.
+    def place(
+        self, size: float, t: float | np.ndarray, now: float, left_s: float
+    ) -> float | np.ndarray:
+        """Time (...) on the tape at real times ``t`` (...) [s]: the rest of it in the time that is
+        left, shifted or held up by ``size`` [s].
         """
         due = now + left_s
         share = np.clip((t - self.from_s) / max(due - self.from_s, STEP_S), 0.0, 1.0)
-        at = t + share * (self._end - due)
+        at = t + share * (self.end_s - due)
         if size >= 0:
-            return np.minimum(at + size * np.sin(np.pi * share**LATE) ** 2, self._end)
-        opens = self._end - self._tight
-        held = self._end - opens / (opens + size) * (self._end - at)
-        return np.where(at > self._tight, np.clip(held, self._tight, self._end), at)
+            return np.minimum(at + size * np.sin(np.pi * share**LATE) ** 2, self.end_s)
+        opens = self.end_s - self.tight_s
+        held = self.end_s - opens / (opens + size) * (self.end_s - at)
+        return np.where(at > self.tight_s, np.clip(held, self.tight_s, self.end_s), at)
 
-    def _left(self, size: float, t: float, left_s: float, momentum: float) -> float:
+    def trunk_turn(self, size: float, t: float, left_s: float, momentum: float) -> float:
         """Turn of the trunk [rad] until touchdown, if the shift is ``size`` from now on."""
-        middle, pace, dt = self._pieces(size, t, left_s, SAMPLES)
+        middle, pace, dt = self.pieces(size, t, left_s, SAMPLES)
         inertia = np.interp(middle, self._t, self._inertias[:, 1, 1])
         carried = np.interp(middle, self._t, self._momenta[:, 1]) * pace
         return float(np.sum((momentum - carried) / inertia) * dt)
 
-    def _pieces(
+    def pieces(
         self, size: float, t: float, left_s: float, count: int
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """Places on the tape (``count``,) until touchdown [s], the pace there [1], and their
         distance [s].
         """
-        place = self._place(size, t + left_s * np.linspace(0, 1, count + 1), t, left_s)
+        place = self.place(size, t + left_s * np.linspace(0, 1, count + 1), t, left_s)
         dt = left_s / count
         return (place[1:] + place[:-1]) / 2, np.diff(place) / dt, dt

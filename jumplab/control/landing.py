@@ -103,10 +103,7 @@ class LandingController:
         self.body = body = WholeBody(robot)
         self.gains = body.size.scaled(GAINS, UNITS)
         self._horizon_s = body.size.of(STOP_HORIZON_S, "s")
-        self._leave = body.size.of(STOP_LEAVE, "rad/s^2")
         self._most_turn = body.size.of(MAX_TURN, "rad/s^2")
-        self._hovers_m = body.size.of(NEAR_GROUND_M, "m")
-        self._damping = body.size.of(FALLBACK_DAMPING, "N m s")
         self.step = RecoveryStep(robot, SOLE_SHARE, force_noise_n)
         self.solver = solver()
         self._loaded_n = max(body.size.of(CONTACT_FORCE_N, "N"), LIKELY * force_noise_n)
@@ -146,7 +143,8 @@ class LandingController:
         if answer.solved:
             tau = body.torque(answer.x)
         else:
-            tau = body.gravity_torque(contact) - self._damping * v[6:]
+            damping = body.size.of(FALLBACK_DAMPING, "N m s")
+            tau = body.gravity_torque(contact) - damping * v[6:]
         return np.clip(np.round(tau, TORQUE_DIGITS), *body.motors.range(v[6:]))
 
     def standing(self, time: float, foot_force: np.ndarray) -> np.ndarray:
@@ -159,8 +157,9 @@ class LandingController:
         loaded = time - self._last_contact <= CONTACT_HOLD_S
         if not loaded.any():
             return loaded
-        height = self.body.soles[:, 2]
-        return loaded | (height - height[loaded].min() < self._hovers_m)
+        body = self.body
+        height = body.soles[:, 2]
+        return loaded | (height - height[loaded].min() < body.size.of(NEAR_GROUND_M, "m"))
 
     def _program(self, time: float, q: np.ndarray, v: np.ndarray, contact: np.ndarray) -> Qp:
         """The QP of one moment."""
@@ -235,12 +234,13 @@ class LandingController:
         motors = self.body.motors
         wish = rate**2 * (self._rest - q[7:]) - 2 * rate * v[6:]
         weight = self._posture_weight.copy()
+        leave = self.body.size.of(STOP_LEAVE, "rad/s^2")
         ahead = q[7:] + v[6:] * self._horizon_s
         for stop, way in ((motors.lower, 1.0), (motors.upper, -1.0)):
             needed = 2 * (way * (stop - ahead) + STOP_MARGIN_RAD) / self._horizon_s**2
             near = needed > 0
             # or a joint that is to go back would rest just there
-            away = np.clip(way * wish, 0.0, self._leave)
+            away = np.clip(way * wish, 0.0, leave)
             wish[near] = way * np.clip(np.maximum(needed, away), 0.0, self._most_turn)[near]
             weight[near] = self.gains.stop_weight
         return wish, weight

@@ -114,7 +114,6 @@ class LaunchFeedback:
             size.of(x, "rad/s") for x in rates
         )
         self._turning = size.of(1.0, "s") ** 4  # on weights of angular accelerations
-        self._most = size.of(MOST, "rad/s^2")
         self._reading = np.array([READING[0], size.of(READING[1], "m")])
         self._fade_rate = max([fade_rate, *(FADED / (FADE_SHARE * x) for x in air_s)])
         self._air_s = next(iter(air_s), np.inf)  # of the first flight
@@ -299,7 +298,8 @@ class LaunchFeedback:
         self._spin = body.momentum_rows @ answer.x - moment
         change = np.round(answer.x[6 : body.nv], DIGITS) - tape
         tau = np.round(body.torque(answer.x), TORQUE_DIGITS) + body.motors.lost(v[6:])
-        return np.clip(change, -self._most, self._most), tau
+        most = body.size.of(MOST, "rad/s^2")
+        return np.clip(change, -most, most), tau
 
     def _creep(self, stand: Stand, carries: np.ndarray) -> np.ndarray:
         """Rate (6,) of the twist with which feet that carry move along the jump and up; none is

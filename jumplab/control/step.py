@@ -50,14 +50,9 @@ class RecoveryStep:
         foot = robot.foot
         large = size(robot)
         self._met_n = max(large.of(MET_N, "N"), SURE * force_noise_n)
-        self._lift_m, self._beside_m, self._beyond_m = (
-            large.of(x, "m") for x in (LIFT_M, BESIDE_M, BEYOND_M)
-        )
         self._reach_m = np.transpose([large.of(np.array(x), "m") for x in (FORWARD_M, ASIDE_M)])
-        self._swing_s, self._least_s, self._settled_s, self._beyond_s = (
-            large.of(x, "s") for x in (SWING_S, LEAST_S, SETTLED_S, BEYOND_S)
-        )
-        self._sink = large.of(SINK, "m/s")
+        self._swing_s = large.of(SWING_S, "s")
+        self._least_s = large.of(LEAST_S, "s")
         self.side: int | None = None
         self.began_s: float | None = None
         self._half = np.array([(foot.toe - foot.heel) / 2, foot.half_width]) * usable
@@ -86,12 +81,12 @@ class RecoveryStep:
 
     def _needed(self, time: float, body: WholeBody, foot_force: np.ndarray) -> bool:
         beyond = False
-        if time > self._settled_s and (foot_force > 0).any():
+        if time > body.size.of(SETTLED_S, "s") and (foot_force > 0).any():
             turned = self._corners @ body.attitudes[:, :2, :2].transpose(0, 2, 1)
             corners = (body.soles[:, None, :2] + turned).reshape(-1, 2)
-            beyond = beyond_hull(_capture_point(body), corners) > self._beyond_m
+            beyond = beyond_hull(_capture_point(body), corners) > body.size.of(BEYOND_M, "m")
         self._beyond_since = min(self._beyond_since, time) if beyond else np.inf
-        return time - self._beyond_since >= self._beyond_s
+        return time - self._beyond_since >= body.size.of(BEYOND_S, "s")
 
     def _foothold(self, body: WholeBody, side: int, left_s: float) -> tuple[np.ndarray, float]:
         """Place (3,) of the sole of ``side`` that catches the robot in ``left_s``, and how far it
@@ -100,7 +95,7 @@ class RecoveryStep:
         axes, capture, pressure = self._over(body, 1 - side)
         out = np.array([1.0, 1.0 if side == 0 else -1.0])  # the foot's own side
         want = pressure + (capture - pressure) * np.exp(left_s / _pendulum_s(body, 1 - side))
-        want = out * want + [0.0, self._beside_m]
+        want = out * want + [0.0, body.size.of(BESIDE_M, "m")]
         there = np.clip(want, *self._reach_m)
         stance = body.soles[1 - side]
         goal = np.append(stance[:2] + axes.T @ (out * there), stance[2])
@@ -136,9 +131,10 @@ class RecoveryStep:
         half = self._swing_s / 2 - gone
         wish = 6 * (self.goal - place) / left**2 - 4 * speed / left
         if half > self._least_s / 2:
-            wish[2] = 6 * (self.goal[2] + self._lift_m - place[2]) / half**2 - 4 * speed[2] / half
+            top = self.goal[2] + body.size.of(LIFT_M, "m")
+            wish[2] = 6 * (top - place[2]) / half**2 - 4 * speed[2] / half
         else:
-            wish[2] += 2 * self._sink / left
+            wish[2] += 2 * body.size.of(SINK, "m/s") / left
         return wish
 
 

@@ -64,15 +64,7 @@ PLANAR_CURVES = {
     "$v_x$ of the CoM [m/s]": ("com_velocity", (..., 0)),
     "$v_z$ of the CoM [m/s]": ("com_velocity", (..., 1)),
 }
-SPATIAL_CURVES = {
-    **{f"$v_{x}$ of the CoM [m/s]": ("com_velocity", (..., k)) for k, x in enumerate("xyz")},
-    **{f"$L_{x}$ [kg m$^2$/s]": ("angular_momentum", (..., k)) for k, x in enumerate("xyz")},
-}
 # ... and of what is simulated too
-SPATIAL_MOTION = {
-    **{f"CoM ${x}$ [m]": ("com", (..., k)) for k, x in enumerate("xyz")},
-    **{f"CoM $v_{x}$ [m/s]": ("com_velocity", (..., k)) for k, x in enumerate("xyz")},
-}
 PLANAR_MOTION = {
     "CoM $x$ [m]": ("com", (..., 0)),
     "CoM $z$ [m]": ("com", (..., 2)),
@@ -81,6 +73,16 @@ PLANAR_MOTION = {
     "CoM $v_z$ [m/s]": ("com_velocity", (..., 2)),
     INERTIA: ("planar_rho", ...),
 }
+
+
+def _components(label: str, name: str) -> dict[str, tuple]:
+    """Curves of all three components of an array, which ``label`` calls "?"."""
+    return {label.replace("?", x): (name, (..., k)) for k, x in enumerate("xyz")}
+
+
+SPATIAL_CURVES = _components("$v_?$ of the CoM [m/s]", "com_velocity")
+SPATIAL_CURVES |= _components("$L_?$ [kg m$^2$/s]", "angular_momentum")
+SPATIAL_MOTION = _components("CoM $?$ [m]", "com") | _components("CoM $v_?$ [m/s]", "com_velocity")
 
 
 def _in_plane(tape: Tape) -> bool:

@@ -120,7 +120,7 @@ def movie(
     landing = motion.t[motion.phase == "landing"]
     shown = motion.t <= (landing[0] + AFTER_TOUCHDOWN_S if len(landing) else np.inf)
     way = trace(robot, motion.q[shown])
-    looks, distance_m = _camera(way, rate)
+    looks, distance_m = camera(way, rate)
     pressed = ground_forces(whole, rate, way, scene) if forces else None
     size = KINDS[kind][1]
     pictures = []
@@ -155,7 +155,7 @@ def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Sce
     return of.robot, of, scene or ground_of(of)
 
 
-def _camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
+def camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
     """Where the camera looks (n, 3) [m] along the way, and its distance [m]; it stands still unless
     the jump is long.
     """

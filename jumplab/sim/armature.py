@@ -35,21 +35,18 @@ class Armature:
         self._motors = []
         self._joints = {}  # of links
         self.lent = {}
-        first: dict[int, str] = {}  # link of each joint's body
-        for frame in model.frames:
-            if frame.type == pin.FrameType.BODY:
-                first.setdefault(frame.parentJoint, frame.name)
+        links = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
+        first = {frame.parentJoint: frame.name for frame in links[::-1]}  # of each joint's body
         for name, armature in zip(robot.joint_names, self._armature, strict=True):
             if armature:
                 here = model.getJointId(name)
                 column = model.idx_vs[here]
                 slope = pin.computeJointJacobian(model, self._data, pin.neutral(model), here)
-                bodies = here, model.parents[here]
-                for body in bodies:
-                    self._joints[first[body]] = body
-                    self.lent[first[body]] = self.lent.get(first[body], 0.0) + armature
-                links = [first[body] for body in bodies]
-                self._motors.append((*links, armature * slope[3:, column], column))
+                bodies = {first[body]: body for body in (here, model.parents[here])}
+                self._joints |= bodies
+                for link in bodies:
+                    self.lent[link] = self.lent.get(link, 0.0) + armature
+                self._motors.append((*bodies, armature * slope[3:, column], column))
 
     def returned(self, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
         """Torque (3,) for each link, world axes, in the step that begins at ``q`` (nq,) and ``v``

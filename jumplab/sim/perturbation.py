@@ -16,7 +16,7 @@ import tomlkit
 
 from jumplab.arguments import checked, real
 from jumplab.control.estimator import SensorNoise
-from jumplab.control.kinematics import Gauge, about_vertical
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import InputError, quoted
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -334,7 +334,7 @@ class Perturbation:
         pushes = []
         for shove in self.shoves:
             begin, until = spans[shove.phase]
-            way = about_vertical(shove.direction_rad)[:, 0]
+            way = np.array([np.cos(shove.direction_rad), np.sin(shove.direction_rad), 0.0])
             force = tuple((shove.impulse_n_s / PUSH_S * way).tolist())
             at = round((begin + shove.share * (until - begin - PUSH_S)) / STEP_S)
             pushes.append(Push(at, round(PUSH_S / STEP_S), force))

@@ -23,7 +23,7 @@ class Sensors:
 
     def __init__(self, noise: SensorNoise, seed: int, gravity: float = GRAVITY):
         # a stream of its own beside the robot's draw
-        self._noise = noise
+        self.noise = noise
         self._rng = np.random.default_rng([seed, 1])
         self._other = np.random.default_rng([seed, 3])
         self._gyro_bias = noise.gyro_bias * self._rng.standard_normal(3)
@@ -33,14 +33,14 @@ class Sensors:
 
     def initial(self, q: np.ndarray) -> np.ndarray:
         """Configuration (nq,) as it is believed to be before the jump: a little tilted."""
-        error = self._noise.tilt_rad * self._rng.standard_normal(2)
+        error = self.noise.tilt_rad * self._rng.standard_normal(2)
         return turned(q, pin.exp3(np.array([*error, 0.0])))
 
     def read(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Reading:
         """Measure the true state (q, v) and the true wrenches (2, 6) under the feet; call it once
         per step.
         """
-        n = self._noise
+        n = self.noise
         draw = self._rng.standard_normal
         attitude = rotation(q[3:7])
         velocity = attitude @ v[:3]
