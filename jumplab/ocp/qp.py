@@ -112,9 +112,6 @@ class Qp:
         weight = None if weight is None else _column(weight, size)
         return Block(name, matrix, below, above, weight, labels)
 
-    def __getitem__(self, name: str) -> Block:
-        return {**self.costs, **self.equalities, **self.limits}[name]
-
     @cached_property
     def matrices(self) -> tuple[np.ndarray, ...]:
         """H, g, C, d, F, low and high of  1/2 x' H x + g' x,  C x = d  and  low <= F x <= high."""
