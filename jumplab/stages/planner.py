@@ -339,7 +339,6 @@ class Planner(Shown):
         InputError, InfeasibleError, SolverError
             If a stage refuses or fails; no later stage is run.
         """
-        require_type(task, JumpTask, "the target")
         method = self.chosen(method, weights)
         self._check(task, method, start)
         if not (starts == 1 or (1 < starts <= len(COMPARED) and near is None)):
@@ -445,7 +444,6 @@ class Planner(Shown):
         InputError, InfeasibleError, SolverError
             If the schedule does not fit the robot, or no motion follows it.
         """
-        require_type(contacts, Contacts, "the contact schedule")
         if contacts.ends != "rest":
             raise InputError(
                 "a schedule that ends at touchdown is a standing jump; ask for it by its target"
