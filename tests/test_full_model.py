@@ -123,7 +123,7 @@ def test_wrench_map(body):
 
 def test_gravity_can_be_another():
     robot = Robot.load()
-    moon, rest = FullBody(robot, gravity=1.62), np.zeros(robot.model.nv)
+    moon, rest = FullBody(robot.under_gravity(1.62)), np.zeros(robot.model.nv)
     weight = moon.terms(stance_configuration(robot), rest).H[[0, 2]]
     assert np.hypot(*weight) == pytest.approx(42 * 1.62) and moon.gravity == pytest.approx(1.62)
     assert FullBody(robot).gravity == pytest.approx(9.8)

@@ -123,14 +123,14 @@ class FullBody:
     """The nine-link robot as a source of :class:`FullTerms`. One per user: it owns Pinocchio's
     scratch data.
 
-    ``gravity`` is positive, the robot's own 9.8 by default [m/s^2]; ``mass`` is in kg; ``motors``
+    ``gravity`` is the robot's, positive [m/s^2]; ``mass`` is in kg; ``motors``
     are the joints'. ``anchors`` are all points by name. ``pairs`` are (left column, right column,
     sign) in the tangent of the joint pairs whose symmetry is demanded, by phase.
     """
 
-    def __init__(self, robot: Robot, gravity: float | None = None):
+    def __init__(self, robot: Robot):
         self.robot = robot
-        self.model = (robot if gravity is None else robot.under_gravity(gravity)).model
+        self.model = robot.model
         self.data = self.model.createData()
         self.nq = self.model.nq
         self.nv = self.model.nv

@@ -10,7 +10,7 @@ every quantity (tests).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -491,11 +491,10 @@ class SpatialState:
     @property
     def rho_rate(self) -> ca.SX:
         """Its rate [kg m^2/s]."""
-
-        def of(q):
-            return SpatialState(self.model, q, q, q, even=self._even).rho
-
-        return rates(of, self.q, self.v)
+        q = ca.SX.sym("q", self.q.numel())
+        v = ca.SX.sym("v", self.q.numel())
+        rho = SpatialState(self.model, q, q, q, even=self._even).rho
+        return ca.Function("rate", [q, v], [ca.jtimes(rho, q, v)])(self.q, self.v)
 
     # points of the bodies
     # ------------------------------------------------------------------------------------------
@@ -542,13 +541,6 @@ class SpatialState:
     def point_velocity(self, body: int, local: np.ndarray) -> ca.SX:
         """Velocity (3,) of a point of a body [m/s]."""
         return self.rotation(body) @ self.own_rates(body, local)[0]
-
-
-def rates(of: Callable[[ca.SX], ca.SX], q: ca.SX, v: ca.SX) -> ca.SX:
-    """Time derivative (m,) of a column that depends on the chart (n,) alone, along rates (n,)."""
-    x = ca.SX.sym("q", q.numel())
-    w = ca.SX.sym("v", q.numel())
-    return ca.Function("rates", [x, w], [ca.jtimes(of(x), x, w)])(q, v)
 
 
 def _spread(x: ca.SX, y: ca.SX) -> ca.SX:

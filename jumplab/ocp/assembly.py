@@ -110,11 +110,11 @@ class Assembled:
         f = functions["rows"]
         counts = [f.size1_out(i) for i in range(f.n_out())]
         columns = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-        step = np.arange(len(nodes))
         kept = np.ones((len(nodes), sum(counts)), bool)
         for term, columns_of in zip(part.constraints, columns, strict=True):
             first, last = term.skip
-            kept[:, columns_of] = ((step >= first) & (step < len(nodes) - last))[:, None]
+            kept[:first, columns_of] = False
+            kept[len(nodes) - last :, columns_of] = False
         number = np.where(kept, self.n_rows - 1 + np.cumsum(kept).reshape(kept.shape), -1)
         self.n_rows += int(kept.sum())
         for term, columns_of in zip(part.constraints, columns, strict=True):

@@ -142,8 +142,7 @@ def functions(
         words = part.words(problem)
         digest = fingerprint(words, key or "")
         if digest not in known:
-            made = _made(formulator, part, words, key)
-            known[digest] = made
+            known[digest] = _made(formulator, part, words, key)
         out.append(known[digest])
     return out
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from jumplab.errors import InputError, quoted, require_type
 from jumplab.ocp.derivatives import JERK_CHAIN, Formulator, Part
-from jumplab.ocp.problem import Bound, Problem, Term, is_named
+from jumplab.ocp.problem import Problem, Term, is_named
 
 
 def changed(
@@ -57,44 +57,36 @@ def changed(
     for owner, extra in (terms or {}).items():
         for term in extra:
             problem = _with(problem, owner, term, look or _digest)
-    problem.check_names(off, "weight or switch")
+    problem.check_names(off)
+    asked: dict[tuple[str, str], float] = {}
     for name, weight in weights.items():
-        problem = _weighted(problem, name, weight)
+        costs = problem.costs(name)
+        _check_weight(name, weight)
+        asked |= dict.fromkeys(costs, float(weight))
     for owner, term in problem.terms():
         if term.identity and is_named(owner, term, off):
             raise InputError(
                 f"term {term.name!r} links the motion to one; it cannot be switched off"
             )
 
-    def left(owner: str, x: Term | Bound) -> Term | Bound | None:
-        idle = (owner, x.name) in problem.own and x.weight == 0
-        return None if idle or is_named(owner, x, off) else x
-
-    return _mapped(problem, left)
-
-
-def _mapped(problem: Problem, change: Callable) -> Problem:
-    """The problem with ``change(owner, term or bound)`` for each; left out where that is None."""
-
-    def each(owner: str, items: tuple) -> tuple:
-        return tuple(new for x in items if (new := change(owner, x)) is not None)
+    def kept(owner: str, items: tuple) -> tuple:
+        """Those that are not left out, with the weights that are asked for."""
+        found = []
+        for x in items:
+            place = owner, x.name
+            if place in asked:
+                x = replace(x, weight=asked[place])
+            if not (is_named(owner, x, off) or (place in problem.own and x.weight == 0)):
+                found.append(x)
+        return tuple(found)
 
     phases = tuple(
-        replace(p, terms=each(p.name, p.terms), bounds=each(p.name, p.bounds))
+        replace(p, terms=kept(p.name, p.terms), bounds=kept(p.name, p.bounds))
         for p in problem.phases
     )
-    out = replace(problem, phases=phases, joints=each(problem.name, problem.joints))
+    out = replace(problem, phases=phases, joints=kept(problem.name, problem.joints))
     left = {(owner, t.name) for owner, t in out.terms()}
     return replace(out, own={name: digest for name, digest in problem.own.items() if name in left})
-
-
-def _weighted(problem: Problem, name: str, weight: Any) -> Problem:
-    """The problem with another weight of a cost."""
-    costs = problem.costs(name)
-    _check_weight(name, weight)
-    return _mapped(
-        problem, lambda o, x: replace(x, weight=float(weight)) if (o, x.name) in costs else x
-    )
 
 
 def _check_weight(name: str, weight: Any) -> None:

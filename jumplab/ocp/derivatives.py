@@ -85,13 +85,9 @@ class Part:
             ends = [(x.constants, x.nodes[0], x.nodes[-1]) for x in layouts.values()]
             return np.zeros(1, int), np.concatenate([y for end in ends for y in end])[None]
         layout = layouts[self.owner]
-        steps = layout.phase.intervals
-        nodes = {
-            "node": np.arange(steps + 1),
-            "start": np.array([0]),
-            "end": np.array([steps]),
-            "interval": np.arange(steps),
-        }[self.place]
+        every = np.arange(layout.phase.intervals + 1)
+        of_place = {"node": every, "start": every[:1], "end": every[-1:], "interval": every[:-1]}
+        nodes = of_place[self.place]
         blocks = [np.tile(layout.constants, (len(nodes), 1)), layout.nodes[nodes]]
         if self.place == "interval":
             blocks += [layout.jerks, layout.nodes[1:]]

@@ -283,13 +283,13 @@ class Problem:
         """(phase name, term or bound) of all of them, in order, terms first."""
         return [*self.terms(), *self.bounds()]
 
-    def check_names(self, names: Iterable[str], what: str) -> None:
+    def check_names(self, names: Iterable[str]) -> None:
         """Raise :class:`InputError` if a name, "name" or "phase/name", is no term or bound here."""
         for name in names:
             if not any(is_named(owner, x, (name,)) for owner, x in self.items()):
                 raise InputError(
-                    f"{what} {quoted(name)}: the problem {self.name!r} has no such term; it has "
-                    f"{nearest({x.name for _, x in self.items()}, name)}"
+                    f"weight or switch {quoted(name)}: the problem {self.name!r} has no such term; "
+                    f"it has {nearest({x.name for _, x in self.items()}, name)}"
                 )
 
     def costs(self, name: str) -> dict[tuple[str, str], float]:
@@ -297,7 +297,7 @@ class Problem:
 
         Raises :class:`InputError` for a name that is no cost's.
         """
-        self.check_names([name], "weight or switch")
+        self.check_names([name])
         named = [(owner, t) for owner, t in self.terms() if is_named(owner, t, (name,))]
         costs = {(owner, t.name): t.weight for owner, t in named if t.is_cost}
         if not costs:

@@ -20,7 +20,7 @@ A controller that poses the same program in every cycle keeps one :class:`QpSolv
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -112,27 +112,21 @@ class Qp:
         weight = None if weight is None else _column(weight, size)
         return Block(name, matrix, below, above, weight, labels)
 
-    def __getitem__(self, name: str) -> Block:
-        return {**self.costs, **self.equalities, **self.limits}[name]
-
     @cached_property
     def matrices(self) -> tuple[np.ndarray, ...]:
         """H, g, C, d, F, low and high of  1/2 x' H x + g' x,  C x = d  and  low <= F x <= high."""
-        n = self.size
-        costs = list(self.costs.values())
-        rows = _stack([b.matrix for b in costs], n)
-        weighted = rows * _join([b.weight for b in costs])[:, None]
-        equal = list(self.equalities.values())
-        limits = list(self.limits.values())
-        return (
-            weighted.T @ rows,
-            -weighted.T @ _join([b.low for b in costs]),
-            _stack([b.matrix for b in equal], n),
-            _join([b.low for b in equal]),
-            _stack([b.matrix for b in limits], n),
-            _join([b.low for b in limits]),
-            _join([b.high for b in limits]),
-        )
+        rows, target, _ = self._joined(self.costs)
+        weight = [b.weight for b in self.costs.values()]
+        weighted = rows * np.concatenate([np.zeros(0), *weight])[:, None]
+        equal, value, _ = self._joined(self.equalities)
+        limits = self._joined(self.limits)
+        return weighted.T @ rows, -weighted.T @ target, equal, value, *limits
+
+    def _joined(self, blocks: dict[str, Block]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Matrix (m, n), low and high (m,) of several blocks, one below the other."""
+        parts = [(b.matrix, b.low, b.high) for b in blocks.values()]
+        nothing = np.zeros((0, self.size)), np.zeros(0), np.zeros(0)
+        return tuple(map(np.concatenate, zip(nothing, *parts, strict=True)))
 
     def constraints(self) -> list[Block]:
         """Equalities, then limits."""
@@ -150,19 +144,11 @@ class Qp:
         return float(v[row]), f"{block.name} {block.labels[row]}"
 
 
-def _stack(matrices: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    return np.concatenate([np.zeros((0, columns)), *matrices])
-
-
 def _column(x: Any, size: int) -> np.ndarray:
     """A column (size,) of a number or a column."""
     out = np.empty(size)
     out[:] = x
     return out
-
-
-def _join(columns: Sequence[np.ndarray]) -> np.ndarray:
-    return np.concatenate([np.zeros(0), *columns])
 
 
 @dataclass(frozen=True)
@@ -241,8 +227,8 @@ def conflict(qp: Qp) -> Conflict | None:
     from scipy.optimize import linprog  # slow to import, and rarely needed
 
     blocks = qp.constraints()
-    matrix = _stack([b.matrix for b in blocks], qp.size)
-    low, high, scale = (_join([getattr(b, k) for b in blocks]) for k in ("low", "high", "scale"))
+    columns = ("matrix", "low", "high", "scale")
+    matrix, low, high, scale = (np.concatenate([getattr(b, k) for b in blocks]) for k in columns)
     names = [(b.name, label) for b in blocks for label in b.labels]
     slack = -np.diag(scale)
     answer = linprog(

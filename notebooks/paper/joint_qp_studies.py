@@ -163,8 +163,9 @@ def against_library(it: Written, mapper: JointMapper, plan: JointPlan) -> tuple[
         it.problem.solve(solver=cp.CLARABEL, enforce_dpp=True, **CLARABEL)
         found = it.x.value, it.problem.value
         _, program, best = alone(mapper, it.qp, step.k, plan)
+        known = program.costs | program.equalities | program.limits
         for name, own in it.rows().items():
-            theirs = _in_force(program[name])
+            theirs = _in_force(known[name])
             sizes[name] = max(sizes[name], len(own[0]))
             for mine, other in zip(own, theirs, strict=True):
                 ends = np.isfinite(other)

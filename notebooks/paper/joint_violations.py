@@ -36,7 +36,8 @@ def joint_violations(plan: JointPlan, robot: Robot, gravity: float | None = None
     ``cop_outside`` is of the sole, of the toe edge once the heel is up; ``pull`` is a negative F_z; ``friction`` the
     largest F_xy / F_z; ``torque_excess`` counts from the motor's line; ``asymmetry`` is of mirrored joints.
     """
-    body, launch, flight = FullBody(robot, gravity), plan.rows("launch"), plan.rows("flight")
+    body = FullBody(robot if gravity is None else robot.under_gravity(gravity))
+    launch, flight = plan.rows("launch"), plan.rows("flight")
     nodes = [body.terms(q, v) for q, v in zip(plan.q, plan.v, strict=True)]
     first = [k for k in range(len(plan.t)) if k + 1 not in (launch.stop, flight.stop)]  # nodes at which a step begins
     steps = [_middle(plan, body, k) for k in first]

@@ -21,7 +21,7 @@ def compared(plan: JointPlan, srmp: SrmpPlan, robot: Robot) -> tuple[dict[str, n
     middle of the soles from the CoM [m].
     """
     launch, flight = plan.rows("launch"), plan.rows("flight")
-    body = FullBody(robot, srmp.task.gravity)
+    body = FullBody(robot.under_gravity(srmp.task.gravity))
     nodes = [body.terms(q, v) for q, v in zip(plan.q, plan.v, strict=True)]
     pivot = nodes[0].sole.place.mean(axis=0)
     actual = {

@@ -139,7 +139,7 @@ class JointMapper:
             if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):
                 limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
                 raise InputError(f"stage 2: step_s = {step!r} s, must be a number between {limits}")
-        self.body = FullBody(robot, srmp.task.gravity)
+        self.body = FullBody(robot.under_gravity(srmp.task.gravity))
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(
