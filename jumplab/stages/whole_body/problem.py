@@ -4,8 +4,8 @@ jumps.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import casadi as ca
@@ -47,35 +47,30 @@ SOUGHT = {
 }
 
 
+@dataclass(eq=False, repr=False)
 class Schedule:
-    """A schedule for one robot: the modes of contact, and the problem that they make."""
+    """A schedule for one robot: the modes of contact, and the problem that they make.
 
-    def __init__(
-        self,
-        body: Body,
-        contacts: Contacts,
-        limits: Limits,
-        weights: Weights,
-        apart: Iterable[Apart] = (),
-        free: Coordinates | None = None,
-        tracking: bool = False,
-        follows: bool = False,
-        sought: tuple[str, ...] = (),
-    ):
-        """``apart`` has rows for links that met; ``free`` are all coordinates if None; with
-        ``tracking`` a jump follows stage 1's trajectories, or it ``follows`` a given motion.
-        ``sought`` are parameters of the target that are unknowns (of :data:`SOUGHT`), the first
-        one as large as possible."""
-        self.sought = sought
-        self.tracking = tracking
-        self.follows = follows
-        self.free = free or whole(body)
-        self.body = body
-        self.contacts = contacts
-        self.limits = limits
-        self.weights = weights
-        self.apart = tuple(apart)
-        self.modes = [Mode(body, limits, weights, p.feet, self.free) for p in contacts.phases]
+    ``apart`` has rows for links that met; ``free`` are all coordinates if None; with ``tracking``
+    a jump follows stage 1's trajectories, or it ``follows`` a given motion. ``sought`` are
+    parameters of the target that are unknowns (of :data:`SOUGHT`), the first one as large as
+    possible.
+    """
+
+    body: Body
+    contacts: Contacts
+    limits: Limits
+    weights: Weights
+    apart: tuple[Apart, ...] = ()
+    free: Coordinates | None = None
+    tracking: bool = False
+    follows: bool = False
+    sought: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        self.free = self.free or whole(self.body)
+        given = self.body, self.limits, self.weights
+        self.modes = [Mode(*given, p.feet, self.free) for p in self.contacts.phases]
 
     def landed(self, k: int) -> list[int]:
         """Sides (0 left, 1 right) of the feet that come down as a phase starts; at first none."""

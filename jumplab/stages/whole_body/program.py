@@ -21,7 +21,7 @@ from jumplab.ocp.solution import PhaseSolution, resampled
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body.apart import merged, too_close
+from jumplab.stages.whole_body.apart import merged, runs, too_close
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.coordinates import KINDS, Coordinates
@@ -119,10 +119,9 @@ class Program(Shown):
     def _nlp(self, apart: tuple[Apart, ...]) -> Nlp:
         key = tuple((x.phase, x.first, x.last, x.pair.key, x.more_m) for x in apart)
         if key not in self._built:
-            if len(self._built) > BUILT:
-                usual = {(): self._built[()]} if () in self._built else {}
-                self._built.clear()
-                self._built.update(usual)
+            with_rows = [x for x in self._built if x]
+            if len(with_rows) == BUILT:
+                del self._built[with_rows[0]]
             words = (
                 f"{self.robot.hash} {self.free.kind} {self.limits} {self.weights} {self.tracking} "
                 f"{self.follows} {self.sought}"
@@ -304,27 +303,27 @@ class Program(Shown):
         phases = self.contacts.phases
         values = {p.name: {} for p in phases}
         for side in self.free.sides:
-            for run in _runs([side not in p.modes for p in phases]):
+            for run in runs(np.flatnonzero([side not in p.modes for p in phases])):
                 lasts = [phases[k].guess_s if self.follows else phases[k].intervals for k in run]
                 ends = np.cumsum([0.0, *lasts])
                 for k, first, last in zip(run, ends, ends[1:], strict=False):
                     at = np.linspace(first, last, phases[k].intervals + 1)
-                    bump = _bump(at / ends[-1])
+                    u = at / ends[-1]
+                    bump = 4 * u * (1 - u)
                     if self.follows:  # a foot does not leave, or come down, at once
                         bump = np.minimum(bump, (np.minimum(at, ends[-1] - at) / RISING_S) ** 3)
                     # in a jump the soles come down steeply, in a step they hardly leave the ground
                     height = bump**3 if run[-1] == len(phases) - 1 else bump
                     if phases[k].flying:
-                        flown = _bump(np.linspace(0, 1, len(bump)))
-                        height = np.maximum(height, flown**3)
+                        u = np.linspace(0, 1, len(bump))
+                        height = np.maximum(height, (4 * u * (1 - u)) ** 3)
                     name = f"{SIDES[side]}_clearance"
                     values[phases[k].name][name] = self.limits.clearance_m * height[None]
-        if self.tracking:
-            for p in phases:
+        schedule = self.schedule() if self.follows else None
+        for k, p in enumerate(phases):
+            if self.tracking:
                 values[p.name] |= _followed(srmp, p.name, p.intervals)
-        if self.follows:
-            schedule = self.schedule()
-            for k, p in enumerate(phases):
+            if self.follows:
                 values[p.name] |= _given(schedule, motion, k)
         return values
 
@@ -358,15 +357,3 @@ def _followed(srmp: SrmpPlan, name: str, intervals: int) -> dict[str, np.ndarray
         key: np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column).T)])
         for key, column in columns.items()
     }
-
-
-def _bump(u: np.ndarray) -> np.ndarray:
-    """From 0 at 0 over 1 to 0 at 1."""
-    return 4 * u * (1 - u)
-
-
-def _runs(flags: list[bool]) -> Iterator[np.ndarray]:
-    """Runs of consecutive indices whose flag is set."""
-    chosen = np.flatnonzero(flags)
-    parts = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
-    return (part for part in parts if len(part))
