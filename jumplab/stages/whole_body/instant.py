@@ -118,8 +118,8 @@ class Instant:
             heel = body.corners[i, 2:].mean(axis=0)
             known |= {f"{side}_toe": (foot, body.tips[i]), f"{side}_heel": (foot, heel)}
             known[f"{side}_sole"] = foot, body.middles[i]
-            for shoulder in body.robot.joints["shoulder_pitch"][i : i + 1]:
-                arm = 1 + body.joint_names.index(shoulder)
+            for column, _ in body.shoulders[i : i + 1]:
+                arm = 1 + column - BASE
                 hands = [x for x in body.limb_points[2:] if arm in body.chain(x[0])]
                 known |= {f"{side}_hand": x for x in hands[:1]}
         if name not in known:

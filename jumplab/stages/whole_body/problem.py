@@ -206,13 +206,9 @@ class Schedule:
         none = np.zeros(len(mode.raised))
         wide = np.full(BASE, ANGLE_BOX_RAD)
         wide[CHART.index("roll")] = lim.roll_rad
-        low = motors.lower + lim.range_margin_rad
-        high = motors.upper - lim.range_margin_rad
         least = -np.inf if mode.flying else lim.straight_knee_rad
         most = np.inf if free.even else lim.knee_rad
-        for k, sign, angle in self.body.knees:
-            bent = sorted((sign * (least - angle), sign * (most - angle)))
-            low[k], high[k] = max(low[k], bent[0]), min(high[k], bent[1])
+        low, high = self.body.ranges(lim.range_margin_rad, least, most)
         low, high = free.within(np.concatenate([-wide, low]), np.concatenate([wide, high]))
         low = np.concatenate([low, none])
         high = np.concatenate([high, none + lim.heel_up_rad])
