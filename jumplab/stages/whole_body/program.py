@@ -17,6 +17,7 @@ from jumplab.errors import Shown, SolverError
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import LEAST_S, Nlp, Solution, left_s
 from jumplab.ocp.posing import Posed, binding, lagrangian, pack, pose
+from jumplab.ocp.problem import Problem
 from jumplab.ocp.solution import PhaseSolution, resampled
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
@@ -173,18 +174,13 @@ class Program(Shown):
         limit = {"max_iter": start.patience, "max_cpu_time": left}
         options = {**IPOPT, **start.options, **limit, **self.options}
         nlp = built.with_options(options, HOLD if start.held else None)
-        parameters = self.parameters(asked.task, asked.stance, asked.srmp)
-        known = {name: parameters[name] for name in self.sought}
+        numbers = self._numbers(asked, nlp.problem)
+        known = {name: numbers["parameters"][name] for name in self.sought}
         guess = {k: replace(x, constants=known | x.constants) for k, x in begin.guess.items()}
         began = time.process_time()
         try:
             solution = nlp.solve(
-                parameters,
-                guess,
-                references=self.references(asked.srmp, asked.motion),
-                weights=self.changes.spread(nlp.problem, asked.weights),
-                multipliers=begin.multipliers,
-                explain=explain,
+                guess=guess, **numbers, multipliers=begin.multipliers, explain=explain
             )
         except SolverError as e:
             asked.note(start, e.iterations, e.status, time.process_time() - began)
@@ -239,10 +235,15 @@ class Program(Shown):
         """The problem of a solution, its numbers, and the solution as a start."""
         a = self._nlp(solved.schedule.apart).assembled
         guess = solved.solution.guess()
-        parameters = self.parameters(asked.task, asked.stance, asked.srmp)
-        weights = self.changes.spread(a.problem, asked.weights)
-        references = self.references(asked.srmp, asked.motion)
-        return a, pose(a, parameters, guess, references, weights), guess
+        return a, pose(a, guess=guess, **self._numbers(asked, a.problem)), guess
+
+    def _numbers(self, asked: Asked, problem: Problem) -> dict[str, Any]:
+        """Parameters, references and weights of a target in a ``problem`` of this program."""
+        return {
+            "parameters": self.parameters(asked.task, asked.stance, asked.srmp),
+            "references": self.references(asked.srmp, asked.motion),
+            "weights": self.changes.spread(problem, asked.weights),
+        }
 
     def found(self, task: JumpTask, solved: Solved) -> JumpTask:
         """The target that a solution has reached: ``task`` with what was sought [m, rad]."""
