@@ -21,7 +21,24 @@ from jumplab.stages.whole_body.instant import Instant
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
-from jumplab.stages.whole_body.terms import largest, link_distance, phase_terms
+from jumplab.stages.whole_body.terms import (
+    body_clearance,
+    dynamics,
+    flight_rows,
+    foot_rows,
+    largest,
+    link_distance,
+    loads,
+    motor_lines,
+    opening_rows,
+    reserve,
+    sides_apart,
+    smoothness,
+    swing_rows,
+    torsion,
+    touchdown_rows,
+)
+from jumplab.stages.whole_body.tracking import following, tracking
 from jumplab.task import RANGES
 
 NAME = "whole body"
@@ -127,25 +144,46 @@ class Schedule:
         parameters |= {"momentum": 1, "launch_s": 2}
         return Problem(NAME, phases, (joining,), parameters)
 
+    def _terms(self, k: int) -> list[Term]:
+        """Terms of a phase, from those that every phase has to those of its end."""
+        m = self.modes[k]
+        phases = self.contacts.phases
+        last = k == len(phases) - 1
+        landed = self.landed(k)
+        once = (int(k > 0 and not landed), 0)  # the phase before has the rows of a shared node
+        terms = [*smoothness(m), *dynamics(m, once), motor_lines(m, once)]
+        terms += [body_clearance(m), *sides_apart(m)]
+        for side in m.sides:  # a first node that is given or shared needs no rows
+            terms += foot_rows(m, side, not landed, side in landed)
+        swinging = [side for side in self.free.sides if side not in m.modes]
+        terms += [swing_rows(m, side, self.follows) for side in swinging]
+        if m.flying:
+            terms += opening_rows(m)
+        if self.tracking:
+            terms += tracking(m)
+        if self.follows:
+            terms += following(m, landed)
+        if m.feet == "LR" or (self.follows and m.feet.isupper()):
+            terms += reserve(m)
+        # where one foot steps the load goes from foot to foot
+        steps = any(len(p.modes) == 1 for p in phases[max(k - 1, 0) : k + 2])
+        if m.feet == "LR" and not steps and (m.limits.least_push or not m.free.even):
+            terms.append(loads(m))
+        if len(m.modes) == 1 or self.follows:
+            terms += [torsion(m, side) for side in m.sides]
+        if m.flying:
+            terms += flight_rows(m)
+        if last and self.contacts.ends == "touchdown":
+            terms += touchdown_rows(m)
+        met = [x for x in self.apart if x.phase == k]
+        terms += [link_distance(m, x, phases[k].intervals) for x in met]
+        return [*terms, *(largest(name) for name in self.sought[:last])]
+
     def _phase(self, k: int) -> Phase:
         mode = self.modes[k]
         phases = self.contacts.phases
         given = phases[k]
         landed = self.landed(k)
-        around = phases[max(k - 1, 0) : k + 2]
-        terms = phase_terms(
-            mode,
-            joined=bool(k) and not landed,
-            first=k == 0,
-            landed=landed,
-            both_carry=all(p.flying or len(p.modes) == 2 for p in around),
-            tracked=self.tracking,
-            follows=self.follows,
-            last=k == len(phases) - 1 and self.contacts.ends == "touchdown",
-        )
-        terms += [link_distance(mode, x, given.intervals) for x in self.apart if x.phase == k]
-        if self.sought and k == len(phases) - 1:
-            terms.append(largest(self.sought[0]))
         swinging = [side for side in self.free.sides if side not in mode.modes]
         references = {f"{SIDES[side]}_clearance": 1 for side in swinging}
         if self.tracking:
@@ -160,7 +198,7 @@ class Schedule:
             mode.coordinates,
             given.intervals,
             given.time_s,
-            tuple(terms),
+            tuple(self._terms(k)),
             (*self._boxes(mode), *self._ends(k)),
             mode.states,
             self._constants(k),

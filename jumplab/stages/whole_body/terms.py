@@ -4,7 +4,7 @@ nothing here solves.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
@@ -20,7 +20,6 @@ from jumplab.stages.whole_body.legs import independent, off_foothold
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.settings import LATE_SHARE, RESERVE_SHARE
 from jumplab.stages.whole_body.shapes import Apart
-from jumplab.stages.whole_body.tracking import following, tracking
 from jumplab.task import GRAVITY
 
 MOMENT_ARM_M = 0.2  # nominal size of moments over that of forces
@@ -567,49 +566,3 @@ def flip_capture_in_plane(m: Mode) -> list[Term]:
         end(*momentum, one_way(1, forward, ahead), *ahead, SPIN_SCALE),
         end(*beyond, one_way(-1, backward, back), *back, PLACE_SCALE),
     ]
-
-
-def phase_terms(
-    m: Mode,
-    *,
-    joined: bool,
-    first: bool,
-    landed: Iterable[int],
-    both_carry: bool,
-    tracked: bool,
-    follows: bool,
-    last: bool,
-) -> list[Term]:
-    """Terms of a phase (all but links that would meet).
-
-    Parameters
-    ----------
-    joined : its first node is the last one of the phase before.  first : it begins in the stance.
-    landed : feet that come down as it begins.  both_carry : on flat feet, between phases on both
-        feet or in flight; where one foot steps the load goes from foot to foot.
-    tracked : it follows stage 1.  follows : it follows a given motion.
-    last : it ends with a touchdown.
-    """
-    once = (int(joined), 0)  # the phase before has the rows of a shared node
-    terms = [*smoothness(m), *dynamics(m, once), motor_lines(m, once)]
-    terms += [body_clearance(m), *sides_apart(m)]
-    for side in m.sides:  # the first node is given, so it needs no rows
-        terms += foot_rows(m, side, joined or first, side in landed)
-    terms += [swing_rows(m, side, follows) for side in m.free.sides if side not in m.modes]
-    if m.flying:
-        terms += opening_rows(m)
-    if tracked:
-        terms += tracking(m)
-    if follows:
-        terms += following(m, landed)
-    if m.feet == "LR" or (follows and m.feet.isupper()):
-        terms += reserve(m)
-    if m.feet == "LR" and both_carry and (m.limits.least_push or not m.free.even):
-        terms.append(loads(m))
-    if len(m.modes) == 1 or follows:
-        terms += [torsion(m, side) for side in m.sides]
-    if m.flying:
-        terms += flight_rows(m)
-    if last:
-        terms += touchdown_rows(m)
-    return terms
