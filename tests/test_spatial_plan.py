@@ -208,9 +208,8 @@ def test_audit_sees_another_goal():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["position", "pd"])
+@pytest.mark.parametrize("task, mode", [(SIDE, "position"), (TURN, "pd")], ids=["side", "turn"])
 @pytest.mark.parametrize("engine", ["bullet", "mujoco"])
-@pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
 def test_playback_lands_in_its_place_and_heading(task, engine, mode):
     result = run(task, mode, engine)
     m = result.metrics
@@ -222,7 +221,7 @@ def test_playback_lands_in_its_place_and_heading(task, engine, mode):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["bullet", "mujoco"])
-@pytest.mark.parametrize("task, tipped_rad", [(SIDE, 0.1), (SIDE, -0.1), (TURN, 0.1), (TURN, -0.1)])
+@pytest.mark.parametrize("task, tipped_rad", [(SIDE, 0.1), (TURN, -0.1)])
 def test_lands_on_one_foot_before_the_other(task, tipped_rad, engine):
     """Tipped sideways in flight, one sole meets the ground 2 cm before the other; the robot stands all the same."""
     result = jl.simulate(jump(task), engine=engine, disturbance=WrongApex(1.0, tipped_rad, direction_rad=np.pi / 2))
@@ -511,10 +510,7 @@ def test_command_line_plans_and_simulates_a_turn(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "task",
-    [JumpTask(0.0, 0.4, 0.1, side_m=0.6), JumpTask(0.5, 0.45, 0.15, side_m=0.4), JumpTask(0.5, 0.4, 0.15, yaw_rad=0.5)],
-)
+@pytest.mark.parametrize("task", [JumpTask(0.5, 0.45, 0.15, side_m=0.4), JumpTask(0.5, 0.4, 0.15, yaw_rad=0.5)])
 def test_platforms_lie_along_the_travel(task):
     plan = jump(task)
     assert jl.audit(plan).passed

@@ -45,7 +45,7 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
         # the first node is given, so that before the second one no row keeps them apart
         near = np.flatnonzero((gaps.max(axis=0) < least_m) & ((phase > 0) | (node >= 1)))
         met = [row for row in near if _distance(body, number, configurations[row]) < least_m]
-        for rows in _runs(np.array(met, int)):
+        for rows in runs(np.array(met, int), 2 * NODES * SAMPLES):
             # one face, or neighbouring phases ask for two
             face = int(np.argmax(gaps[:, rows].min(axis=1)))
             ends = (one[0], other[0]) if face < 6 else (other[0], one[0])
@@ -89,9 +89,9 @@ def face_gaps(one: Placed, other: Placed) -> np.ndarray:
     return np.stack([-ahead - room, ahead - room], axis=-1).reshape(len(room), 6).T
 
 
-def _runs(rows: np.ndarray) -> list[np.ndarray]:
-    """Rows that follow each other with gaps of some nodes at most."""
-    parts = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * NODES * SAMPLES) + 1)
+def runs(rows: np.ndarray, gap: int = 1) -> list[np.ndarray]:
+    """Parts of rising numbers (n,) that follow each other with no ``gap`` wider than that."""
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) > gap) + 1)
     return [x for x in parts if len(x)]
 
 

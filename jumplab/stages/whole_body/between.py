@@ -76,7 +76,7 @@ def _pressed_outside(tape: Tape, robot: Robot, turn: np.ndarray) -> np.ndarray:
     ahead = turn[..., :2, 0] / np.linalg.norm(turn[..., :2, 0], axis=-1, keepdims=True)
     along = ahead[..., 0] * x + ahead[..., 1] * y
     across = ahead[..., 0] * y - ahead[..., 1] * x
-    length = np.where(tape.extra["contacts"] == FLAT, foot.toe - foot.heel, 0.0)
+    length = np.where(tape.contacts == FLAT, foot.toe - foot.heel, 0.0)
     outside = np.max([along, -along - length, np.abs(across) - foot.half_width], axis=0)
     return np.where(np.isnan(load), -np.inf, outside)
 
@@ -94,11 +94,8 @@ def _low(
     points = origin[:, :, None] + np.einsum("nkij,pj->nkpi", turn, sole)
     height = (points[..., 2] - surface.below(points)).min(axis=2)
     shares = np.full(height.shape, -np.inf)
-    flying = np.flatnonzero(~tape.extra["contacts"].any(axis=1))
-    for rows in np.split(flying, np.flatnonzero(np.diff(flying) > 1) + 1):
-        if not len(rows):
-            continue
-        t = tape.t[rows] - tape.t[rows[0]]
+    for rows in tape.flights:
+        t = tape.t[rows] - tape.t[rows.start]
         middle = (t >= MIDDLE[0] * t[-1]) & (t <= MIDDLE[1] * t[-1])
         shares[rows] = np.where(middle[:, None], 2 - height[rows] / clear, -height[rows] / SUNK_M)
     return shares

@@ -70,6 +70,20 @@ class Body:
         anchors = on_feet(self.robot, point)
         return [self.model.local(x.joint, x.placement.translation) for x in anchors]
 
+    def ranges(
+        self, margin_rad: float, least_rad: float, most_rad: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper angles of the joints (joints,), by a margin off their stops, with knees
+        bent by ``least_rad`` to ``most_rad``.
+        """
+        low = self.motors.lower + margin_rad
+        high = self.motors.upper - margin_rad
+        for k, sign, angle in self.knees:
+            bent = sorted((sign * (least_rad - angle), sign * (most_rad - angle)))
+            low[k] = max(low[k], bent[0])
+            high[k] = min(high[k], bent[1])
+        return low, high
+
     @cached_property
     def leg_m(self) -> float:
         """Length l of the legs in the stance [m]."""

@@ -30,11 +30,6 @@ MOST = 30  # steps or jumps in a row; a program of more is too large to solve
 STEP_SHARE = 0.33  # of the leg: a step or hop of usual length
 
 
-def sole_length(robot: Robot) -> float:
-    """Length of the sole [m]."""
-    return robot.foot.toe - robot.foot.heel
-
-
 def modes_of(feet: str) -> dict[int, str]:
     """Side (0 left, 1 right) -> "flat" or "toe", of ``feet`` as of :class:`ContactPhase`."""
     sides = sorted(("LR".index(c.upper()), c) for c in feet if c != FLIGHT)
@@ -353,7 +348,8 @@ def _check_count(name: str, count: int, least: int) -> None:
 
 def _off(robot: Robot, given_m: float | None) -> float:
     """The way off an edge [m]: a step, and the sole."""
-    return _step(robot, None) + sole_length(robot) if given_m is None else given_m
+    foot = robot.foot
+    return _step(robot, None) + (foot.toe - foot.heel) if given_m is None else given_m
 
 
 def _fault_of(p: ContactPhase) -> str:

@@ -118,8 +118,8 @@ class Instant:
             heel = body.corners[i, 2:].mean(axis=0)
             known |= {f"{side}_toe": (foot, body.tips[i]), f"{side}_heel": (foot, heel)}
             known[f"{side}_sole"] = foot, body.middles[i]
-            for shoulder in body.robot.joints["shoulder_pitch"][i : i + 1]:
-                arm = 1 + body.joint_names.index(shoulder)
+            for column, _ in body.shoulders[i : i + 1]:
+                arm = 1 + column - BASE
                 hands = [x for x in body.limb_points[2:] if arm in body.chain(x[0])]
                 known |= {f"{side}_hand": x for x in hands[:1]}
         if name not in known:
@@ -223,14 +223,13 @@ class Instant:
         phi = self.pitch(side, self._point.q)
         c = ca.cos(phi)
         s = ca.sin(phi)
-        force = ca.SX.zeros(3)
-        moment = ca.SX.zeros(3)
-        for place, f in self.pushes(side):
-            seen = ca.vertcat(c * f[0] - s * f[2], f[1], s * f[0] + c * f[2])
-            force += seen
-            moment += cross(ca.DM(place), seen)
         turn = ca.DM(body.axes[side])
-        return turn @ force, turn @ moment + cross(ca.DM(body.tips[side]), turn @ force)
+        # a foot turns about its toe edge, where all points are if it is pitched
+        force, moment = (
+            turn @ ca.vertcat(c * x[0] - s * x[2], x[1], s * x[0] + c * x[2])
+            for x in self.pressed(side)
+        )
+        return force, moment + cross(ca.DM(body.tips[side]), force)
 
     @property
     def feet_forces(self) -> list[ca.SX]:

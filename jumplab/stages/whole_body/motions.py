@@ -163,11 +163,7 @@ class Reach:
         self.data = body.model.model.createData()
         self.feet = on_feet(body.robot, body.robot.foot.tip)
         self.give = give_of(body.robot)
-        low = body.model.model.lowerPositionLimit[7:] + margin_rad
-        high = body.model.model.upperPositionLimit[7:] - margin_rad
-        for k, sign, angle in body.knees:
-            bent = sorted((sign * (LEAST_BEND_RAD - angle), sign * np.inf))
-            low[k], high[k] = max(low[k], bent[0]), min(high[k], bent[1])
+        low, high = body.ranges(margin_rad, LEAST_BEND_RAD, np.inf)
         stance = body.stance[BASE:]
         self.limits = np.minimum(low, stance), np.maximum(high, stance)
 

@@ -4,8 +4,8 @@ jumps.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import casadi as ca
@@ -21,7 +21,24 @@ from jumplab.stages.whole_body.instant import Instant
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
-from jumplab.stages.whole_body.terms import largest, link_distance, phase_terms
+from jumplab.stages.whole_body.terms import (
+    body_clearance,
+    dynamics,
+    flight_rows,
+    foot_rows,
+    largest,
+    link_distance,
+    loads,
+    motor_lines,
+    opening_rows,
+    reserve,
+    sides_apart,
+    smoothness,
+    swing_rows,
+    torsion,
+    touchdown_rows,
+)
+from jumplab.stages.whole_body.tracking import following, tracking
 from jumplab.task import RANGES
 
 NAME = "whole body"
@@ -47,35 +64,30 @@ SOUGHT = {
 }
 
 
+@dataclass(eq=False, repr=False)
 class Schedule:
-    """A schedule for one robot: the modes of contact, and the problem that they make."""
+    """A schedule for one robot: the modes of contact, and the problem that they make.
 
-    def __init__(
-        self,
-        body: Body,
-        contacts: Contacts,
-        limits: Limits,
-        weights: Weights,
-        apart: Iterable[Apart] = (),
-        free: Coordinates | None = None,
-        tracking: bool = False,
-        follows: bool = False,
-        sought: tuple[str, ...] = (),
-    ):
-        """``apart`` has rows for links that met; ``free`` are all coordinates if None; with
-        ``tracking`` a jump follows stage 1's trajectories, or it ``follows`` a given motion.
-        ``sought`` are parameters of the target that are unknowns (of :data:`SOUGHT`), the first
-        one as large as possible."""
-        self.sought = sought
-        self.tracking = tracking
-        self.follows = follows
-        self.free = free or whole(body)
-        self.body = body
-        self.contacts = contacts
-        self.limits = limits
-        self.weights = weights
-        self.apart = tuple(apart)
-        self.modes = [Mode(body, limits, weights, p.feet, self.free) for p in contacts.phases]
+    ``apart`` has rows for links that met; ``free`` are all coordinates if None; with ``tracking``
+    a jump follows stage 1's trajectories, or it ``follows`` a given motion. ``sought`` are
+    parameters of the target that are unknowns (of :data:`SOUGHT`), the first one as large as
+    possible.
+    """
+
+    body: Body
+    contacts: Contacts
+    limits: Limits
+    weights: Weights
+    apart: tuple[Apart, ...] = ()
+    free: Coordinates | None = None
+    tracking: bool = False
+    follows: bool = False
+    sought: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        self.free = self.free or whole(self.body)
+        given = self.body, self.limits, self.weights
+        self.modes = [Mode(*given, p.feet, self.free) for p in self.contacts.phases]
 
     def landed(self, k: int) -> list[int]:
         """Sides (0 left, 1 right) of the feet that come down as a phase starts; at first none."""
@@ -132,25 +144,46 @@ class Schedule:
         parameters |= {"momentum": 1, "launch_s": 2}
         return Problem(NAME, phases, (joining,), parameters)
 
+    def _terms(self, k: int) -> list[Term]:
+        """Terms of a phase, from those that every phase has to those of its end."""
+        m = self.modes[k]
+        phases = self.contacts.phases
+        last = k == len(phases) - 1
+        landed = self.landed(k)
+        once = (int(k > 0 and not landed), 0)  # the phase before has the rows of a shared node
+        terms = [*smoothness(m), *dynamics(m, once), motor_lines(m, once)]
+        terms += [body_clearance(m), *sides_apart(m)]
+        for side in m.sides:  # a first node that is given or shared needs no rows
+            terms += foot_rows(m, side, not landed, side in landed)
+        swinging = [side for side in self.free.sides if side not in m.modes]
+        terms += [swing_rows(m, side, self.follows) for side in swinging]
+        if m.flying:
+            terms += opening_rows(m)
+        if self.tracking:
+            terms += tracking(m)
+        if self.follows:
+            terms += following(m, landed)
+        if m.feet == "LR" or (self.follows and m.feet.isupper()):
+            terms += reserve(m)
+        # where one foot steps the load goes from foot to foot
+        steps = any(len(p.modes) == 1 for p in phases[max(k - 1, 0) : k + 2])
+        if m.feet == "LR" and not steps and (m.limits.least_push or not m.free.even):
+            terms.append(loads(m))
+        if len(m.modes) == 1 or self.follows:
+            terms += [torsion(m, side) for side in m.sides]
+        if m.flying:
+            terms += flight_rows(m)
+        if last and self.contacts.ends == "touchdown":
+            terms += touchdown_rows(m)
+        met = [x for x in self.apart if x.phase == k]
+        terms += [link_distance(m, x, phases[k].intervals) for x in met]
+        return [*terms, *(largest(name) for name in self.sought[:last])]
+
     def _phase(self, k: int) -> Phase:
         mode = self.modes[k]
         phases = self.contacts.phases
         given = phases[k]
         landed = self.landed(k)
-        around = phases[max(k - 1, 0) : k + 2]
-        terms = phase_terms(
-            mode,
-            joined=bool(k) and not landed,
-            first=k == 0,
-            landed=landed,
-            both_carry=all(p.flying or len(p.modes) == 2 for p in around),
-            tracked=self.tracking,
-            follows=self.follows,
-            last=k == len(phases) - 1 and self.contacts.ends == "touchdown",
-        )
-        terms += [link_distance(mode, x, given.intervals) for x in self.apart if x.phase == k]
-        if self.sought and k == len(phases) - 1:
-            terms.append(largest(self.sought[0]))
         swinging = [side for side in self.free.sides if side not in mode.modes]
         references = {f"{SIDES[side]}_clearance": 1 for side in swinging}
         if self.tracking:
@@ -165,7 +198,7 @@ class Schedule:
             mode.coordinates,
             given.intervals,
             given.time_s,
-            tuple(terms),
+            tuple(self._terms(k)),
             (*self._boxes(mode), *self._ends(k)),
             mode.states,
             self._constants(k),
@@ -211,13 +244,9 @@ class Schedule:
         none = np.zeros(len(mode.raised))
         wide = np.full(BASE, ANGLE_BOX_RAD)
         wide[CHART.index("roll")] = lim.roll_rad
-        low = motors.lower + lim.range_margin_rad
-        high = motors.upper - lim.range_margin_rad
         least = -np.inf if mode.flying else lim.straight_knee_rad
         most = np.inf if free.even else lim.knee_rad
-        for k, sign, angle in self.body.knees:
-            bent = sorted((sign * (least - angle), sign * (most - angle)))
-            low[k], high[k] = max(low[k], bent[0]), min(high[k], bent[1])
+        low, high = self.body.ranges(lim.range_margin_rad, least, most)
         low, high = free.within(np.concatenate([-wide, low]), np.concatenate([wide, high]))
         low = np.concatenate([low, none])
         high = np.concatenate([high, none + lim.heel_up_rad])

@@ -17,11 +17,12 @@ from jumplab.errors import Shown, SolverError
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import LEAST_S, Nlp, Solution, left_s
 from jumplab.ocp.posing import Posed, binding, lagrangian, pack, pose
+from jumplab.ocp.problem import Problem
 from jumplab.ocp.solution import PhaseSolution, resampled
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body.apart import merged, too_close
+from jumplab.stages.whole_body.apart import merged, runs, too_close
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.coordinates import KINDS, Coordinates
@@ -119,10 +120,9 @@ class Program(Shown):
     def _nlp(self, apart: tuple[Apart, ...]) -> Nlp:
         key = tuple((x.phase, x.first, x.last, x.pair.key, x.more_m) for x in apart)
         if key not in self._built:
-            if len(self._built) > BUILT:
-                usual = {(): self._built[()]} if () in self._built else {}
-                self._built.clear()
-                self._built.update(usual)
+            with_rows = [x for x in self._built if x]
+            if len(with_rows) == BUILT:
+                del self._built[with_rows[0]]
             words = (
                 f"{self.robot.hash} {self.free.kind} {self.limits} {self.weights} {self.tracking} "
                 f"{self.follows} {self.sought}"
@@ -174,18 +174,13 @@ class Program(Shown):
         limit = {"max_iter": start.patience, "max_cpu_time": left}
         options = {**IPOPT, **start.options, **limit, **self.options}
         nlp = built.with_options(options, HOLD if start.held else None)
-        parameters = self.parameters(asked.task, asked.stance, asked.srmp)
-        known = {name: parameters[name] for name in self.sought}
+        numbers = self._numbers(asked, nlp.problem)
+        known = {name: numbers["parameters"][name] for name in self.sought}
         guess = {k: replace(x, constants=known | x.constants) for k, x in begin.guess.items()}
         began = time.process_time()
         try:
             solution = nlp.solve(
-                parameters,
-                guess,
-                references=self.references(asked.srmp, asked.motion),
-                weights=self.changes.spread(nlp.problem, asked.weights),
-                multipliers=begin.multipliers,
-                explain=explain,
+                guess=guess, **numbers, multipliers=begin.multipliers, explain=explain
             )
         except SolverError as e:
             asked.note(start, e.iterations, e.status, time.process_time() - began)
@@ -240,10 +235,15 @@ class Program(Shown):
         """The problem of a solution, its numbers, and the solution as a start."""
         a = self._nlp(solved.schedule.apart).assembled
         guess = solved.solution.guess()
-        parameters = self.parameters(asked.task, asked.stance, asked.srmp)
-        weights = self.changes.spread(a.problem, asked.weights)
-        references = self.references(asked.srmp, asked.motion)
-        return a, pose(a, parameters, guess, references, weights), guess
+        return a, pose(a, guess=guess, **self._numbers(asked, a.problem)), guess
+
+    def _numbers(self, asked: Asked, problem: Problem) -> dict[str, Any]:
+        """Parameters, references and weights of a target in a ``problem`` of this program."""
+        return {
+            "parameters": self.parameters(asked.task, asked.stance, asked.srmp),
+            "references": self.references(asked.srmp, asked.motion),
+            "weights": self.changes.spread(problem, asked.weights),
+        }
 
     def found(self, task: JumpTask, solved: Solved) -> JumpTask:
         """The target that a solution has reached: ``task`` with what was sought [m, rad]."""
@@ -304,27 +304,27 @@ class Program(Shown):
         phases = self.contacts.phases
         values = {p.name: {} for p in phases}
         for side in self.free.sides:
-            for run in _runs([side not in p.modes for p in phases]):
+            for run in runs(np.flatnonzero([side not in p.modes for p in phases])):
                 lasts = [phases[k].guess_s if self.follows else phases[k].intervals for k in run]
                 ends = np.cumsum([0.0, *lasts])
                 for k, first, last in zip(run, ends, ends[1:], strict=False):
                     at = np.linspace(first, last, phases[k].intervals + 1)
-                    bump = _bump(at / ends[-1])
+                    u = at / ends[-1]
+                    bump = 4 * u * (1 - u)
                     if self.follows:  # a foot does not leave, or come down, at once
                         bump = np.minimum(bump, (np.minimum(at, ends[-1] - at) / RISING_S) ** 3)
                     # in a jump the soles come down steeply, in a step they hardly leave the ground
                     height = bump**3 if run[-1] == len(phases) - 1 else bump
                     if phases[k].flying:
-                        flown = _bump(np.linspace(0, 1, len(bump)))
-                        height = np.maximum(height, flown**3)
+                        u = np.linspace(0, 1, len(bump))
+                        height = np.maximum(height, (4 * u * (1 - u)) ** 3)
                     name = f"{SIDES[side]}_clearance"
                     values[phases[k].name][name] = self.limits.clearance_m * height[None]
-        if self.tracking:
-            for p in phases:
+        schedule = self.schedule() if self.follows else None
+        for k, p in enumerate(phases):
+            if self.tracking:
                 values[p.name] |= _followed(srmp, p.name, p.intervals)
-        if self.follows:
-            schedule = self.schedule()
-            for k, p in enumerate(phases):
+            if self.follows:
                 values[p.name] |= _given(schedule, motion, k)
         return values
 
@@ -358,15 +358,3 @@ def _followed(srmp: SrmpPlan, name: str, intervals: int) -> dict[str, np.ndarray
         key: np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column).T)])
         for key, column in columns.items()
     }
-
-
-def _bump(u: np.ndarray) -> np.ndarray:
-    """From 0 at 0 over 1 to 0 at 1."""
-    return 4 * u * (1 - u)
-
-
-def _runs(flags: list[bool]) -> Iterator[np.ndarray]:
-    """Runs of consecutive indices whose flag is set."""
-    chosen = np.flatnonzero(flags)
-    parts = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
-    return (part for part in parts if len(part))

@@ -244,7 +244,7 @@ class Mesh:
 
     def intervals(self) -> dict[str, int]:
         """By the names of the phases."""
-        return {"flat": self.flat, "toe": self.toe, "flight": self.flight}
+        return dict(vars(self))
 
     def nodes(self, split: float, takeoff: float, end: float) -> dict[str, np.ndarray]:
         """Times of the nodes [s] from the start of the launch, by the ends of the phases."""

@@ -208,14 +208,13 @@ COMPARED = (
         )
     ),
 )
-ASIDE = (Start("ramp", from_straight, True, 150), *COLD)
+# a jump straight ahead, led aside, begins as near its limits as it will be; a barrier that ends
+# where the cost is within 0.1 % of its least lets it take whole steps to the end
+RAMPED = QUICK | {"mu_init": 1e-2, "mu_min": 1e-4}
+ASIDE = (Start("ramp", from_straight, True, 150, RAMPED), *COLD)
 # in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is
 # tried soon
-IN_PLANE = (
-    Start("schedule", from_schedule, True, 50),
-    Start("schedule", from_schedule, False, 150),
-    Start(STANCE, from_stance, False, 80),
-)
+IN_PLANE = (replace(COLD[0], patience=50), *COLD[1:])
 GIVEN = (
     Start("given motion", from_motion, True, 60),
     Start("given motion", from_motion, False, 150),

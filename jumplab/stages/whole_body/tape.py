@@ -192,11 +192,10 @@ def _ground(
         sampled = phase.sample(at)
         motion = [x[:, : b.nv] for x in sampled]
         if before is not None:  # accelerations may jump where a foot lands
-            places, rates, gains = (x[-1] for x in before.motion)
+            ends = [x[-1] for x in before.motion]
             first = solved[numbers[0]]
-            after = (first.q[0, : b.nv], first.v[0, : b.nv], gains)
-            since = instants - t[0]
-            more = _joining((places, rates, gains), after, since, t[-1] - t[0])
+            after = (first.q[0, : b.nv], first.v[0, : b.nv], ends[2])
+            more = _joining(ends, after, instants - t[0], t[-1] - t[0])
             motion = [x + y for x, y in zip(motion, more, strict=True)]
         pitch = {side: [x[:, b.nv + i] for x in sampled] for i, side in enumerate(b.raised)}
         holds = holds_of(phase, b)

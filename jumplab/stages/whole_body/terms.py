@@ -4,7 +4,7 @@ nothing here solves.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
@@ -20,7 +20,6 @@ from jumplab.stages.whole_body.legs import independent, off_foothold
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.settings import LATE_SHARE, RESERVE_SHARE
 from jumplab.stages.whole_body.shapes import Apart
-from jumplab.stages.whole_body.tracking import following, tracking
 from jumplab.task import GRAVITY
 
 MOMENT_ARM_M = 0.2  # nominal size of moments over that of forces
@@ -39,15 +38,6 @@ FAR = 100.0  # [m, m/s, rad] beyond any of it, so that its cost is nearly a stra
 WORTH = 1000.0
 
 CLEAR = {"scale": PLACE_SCALE, "group": "clearance"}
-
-
-def all_phases(m: Mode, joined: bool) -> list[Term]:
-    """Terms of every phase. Where it shares its first node with the phase before (``joined``), that
-    one has the rows of the dynamics there.
-    """
-    once = (int(joined), 0)
-    terms = [*smoothness(m), *dynamics(m, once), motor_lines(m, once)]
-    return [*terms, body_clearance(m), *sides_apart(m)]
 
 
 def smoothness(m: Mode) -> list[Term]:
@@ -136,23 +126,21 @@ def body_clearance(m: Mode) -> Term:
     body = m.body
     lim = m.limits
     counted = set(m.model.left_half if m.free.even else range(len(m.model.bodies)))
-    knees = [(spot, lim.body_clearance_m + body.shank_m) for spot in body.limb_points[:2]]
-    hands = [(spot, lim.body_clearance_m) for spot in body.limb_points[2:]]
-    limbs = [(spot, least) for spot, least in knees + hands if spot[0] in counted]
+    room = [lim.body_clearance_m + body.shank_m] * 2  # of the knees; of the hands less
+    room += [lim.body_clearance_m] * (len(body.limb_points) - 2)
+    limbs = [x for x in zip(body.limb_points, room, strict=True) if x[0][0] in counted]
     shanks = [spot for spot in body.shank_points if spot[0] in counted]
     face = body.shank_m + lim.shank_clearance_m
 
     def heights(p):
-        up = p.p.platform > 0
         lowest = ca.fmin(p.p.platform, 0)
-        out = []
-        for spot, _ in limbs:
-            x = p.tree.point(*spot)
-            out.append(x[2] - p.ground(x, lim.edge_clearance_m))
-        for spot in shanks:
-            x = p.tree.point(*spot)
-            out.append(x[2] - lowest - up * (p.p.platform + face) * p.over_edge(x, face))
-        return ca.vertcat(*out)
+        step = (p.p.platform > 0) * (p.p.platform + face)
+        points = [p.tree.point(*spot) for spot, _ in limbs]
+        faces = [p.tree.point(*spot) for spot in shanks]
+        return ca.vertcat(
+            *(x[2] - p.ground(x, lim.edge_clearance_m) for x in points),
+            *(x[2] - lowest - step * p.over_edge(x, face) for x in faces),
+        )
 
     least = np.array([least for _, least in limbs] + [0.0] * len(shanks))
     words = "body clearance", "ours", "m", "node"
@@ -339,9 +327,9 @@ def swing_rows(m: Mode, side: int, follows: bool) -> Term:
     def heights(p):
         asked = getattr(p.ref, f"{SIDES[side]}_clearance")
         more = margin * asked / m.limits.clearance_m if follows else margin
-        lows = [(place, asked) for place in places] + [(np.zeros(3), body.ankle_m + more)]
-        points = [(p.tree.point(foot, place), low) for place, low in lows]
-        return ca.vertcat(*(x[2] - p.ground(x) - low for x, low in points))
+        lows = [asked] * len(places) + [body.ankle_m + more]
+        points = [p.tree.point(foot, place) for place in (*places, np.zeros(3))]
+        return ca.vertcat(*(x[2] - p.ground(x) - low for x, low in zip(points, lows, strict=True)))
 
     words = f"clearance of {SIDES[side]} sole", "ours", "m", "node"
     return Term(*words, heights, upper=np.inf, skip=(1, 1), **CLEAR)
@@ -578,48 +566,3 @@ def flip_capture_in_plane(m: Mode) -> list[Term]:
         end(*momentum, one_way(1, forward, ahead), *ahead, SPIN_SCALE),
         end(*beyond, one_way(-1, backward, back), *back, PLACE_SCALE),
     ]
-
-
-def phase_terms(
-    m: Mode,
-    *,
-    joined: bool,
-    first: bool,
-    landed: Iterable[int],
-    both_carry: bool,
-    tracked: bool,
-    follows: bool,
-    last: bool,
-) -> list[Term]:
-    """Terms of a phase (all but links that would meet).
-
-    Parameters
-    ----------
-    joined : its first node is the last one of the phase before.  first : it begins in the stance.
-    landed : feet that come down as it begins.  both_carry : on flat feet, between phases on both
-        feet or in flight; where one foot steps the load goes from foot to foot.
-    tracked : it follows stage 1.  follows : it follows a given motion.
-    last : it ends with a touchdown.
-    """
-    terms = all_phases(m, joined)
-    for side in m.sides:  # the first node is given, so it needs no rows
-        terms += foot_rows(m, side, joined or first, side in landed)
-    terms += [swing_rows(m, side, follows) for side in m.free.sides if side not in m.modes]
-    if m.flying:
-        terms += opening_rows(m)
-    if tracked:
-        terms += tracking(m)
-    if follows:
-        terms += following(m, landed)
-    if m.feet == "LR" or (follows and m.feet.isupper()):
-        terms += reserve(m)
-    if m.feet == "LR":
-        if both_carry and (m.limits.least_push or not m.free.even):
-            terms.append(loads(m))
-    if len(m.modes) == 1 or follows:
-        terms += [torsion(m, side) for side in m.sides]
-    if m.flying:
-        terms += flight_rows(m)
-    if last:
-        terms += touchdown_rows(m)
-    return terms
