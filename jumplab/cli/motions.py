@@ -10,8 +10,8 @@ from jumplab.cli.common import Late, pages, print_summary, robots, store, tables
 from jumplab.cli.common import judge as audited
 from jumplab.errors import InfeasibleError
 
-api = Late("api")
 auditing = Late("auditing")
+studies = Late("studies")
 
 REPORT = "judged.json"
 CHANGES = "mended.json"
@@ -20,7 +20,7 @@ CHANGES = "mended.json"
 def judge(args: Namespace) -> None:
     """Judge motion clips: what of them no robot could do."""
     robot = robots.Robot.load(args.robot)
-    found = api.judge(args.file, robot, fps=args.fps, order=args.order)
+    found = auditing.clip.judge(args.file, robot, fps=args.fps, order=args.order)
     reports = found if isinstance(found, list) else [found]
     passed = sum(report.passed for report in reports)
     rows = [report.row() for report in reports]
@@ -59,7 +59,7 @@ def mend(args: Namespace) -> None:
     """The nearest motion to a clip that the robot can do, as a plan."""
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    mended = api.mend(args.file, robot, fps=args.fps, order=args.order)
+    mended = studies.mend.mend(args.file, robot, fps=args.fps, order=args.order)
     plan = mended.plan
 
     def complete(folder: Path) -> Any:
