@@ -71,7 +71,7 @@ def plan(
     contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of
         your own; or the words of :meth:`Contacts.named`, such as "hop=0.2". It is planned by the
         whole-body program, and audited foot by foot.
-    like : a clip, what :func:`jumplab.judge` takes or returned of it, in whose manner the target is to
+    like : a clip, as :func:`jumplab.judge` takes or returns it, in whose manner the target is to
         be reached: one flight off both feet and down on both, on level ground.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
     method : "direct" (the whole body alone) or, for targets in the plane, "three-step" (SRMP,
