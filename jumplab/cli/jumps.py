@@ -83,9 +83,9 @@ def plan(args: Namespace) -> None:
         ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     else:
         without(args, "says what --robust allows for, which is not given", disturb=[])
-    options = given(api.plan, args, task=task, robot=robot, robust=ranges)
+    options = given(api.plan, args, task=task, robot=robot, robust=ranges, atlas=atlas)
     with warnings.catch_warnings(action="ignore"):  # the audit is told below
-        plan = api.plan(**options, atlas=atlas)
+        plan = api.plan(**options)
     report = api.save(args.out, plan)
     args.found |= {"out": args.out, "plan": plan.summary, "audit": _audited(report)}
     print_summary(plan.summary)
