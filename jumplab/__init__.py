@@ -21,13 +21,12 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab import errors as errors
     from jumplab import show as plots  # noqa: F401
     from jumplab.api import audit as audit
-    from jumplab.api import judge as judge
     from jumplab.api import load as load
-    from jumplab.api import mend as mend
     from jumplab.api import plan as plan
     from jumplab.api import save as save
     from jumplab.api import simulate as simulate
     from jumplab.api import view as view
+    from jumplab.auditing.clip import judge as judge
     from jumplab.ocp import Term as Term
     from jumplab.robot.description import Robot as Robot
     from jumplab.sim.perturbation import Perturbation as Perturbation
@@ -40,6 +39,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab.studies.atlas import Atlas as Atlas
     from jumplab.studies.chain import run_chain as run_chain
     from jumplab.studies.envelope import envelope as envelope
+    from jumplab.studies.mend import mend as mend
     from jumplab.studies.record import record as record
     from jumplab.studies.trials import run_trials as run_trials
     from jumplab.task import JumpTask as JumpTask
@@ -56,8 +56,8 @@ _PLACES = {
     "Term": "ocp",
     "plan": "api",
     "audit": "api",
-    "judge": "api",
-    "mend": "api",
+    "judge": "auditing.clip",
+    "mend": "studies.mend",
     "simulate": "api",
     "save": "api",
     "load": "api",

@@ -27,11 +27,10 @@ from jumplab.stages.whole_body.settings import Limits, Mesh
 from jumplab.task import JumpTask
 
 if TYPE_CHECKING:  # what only some of the functions need is imported by them
-    from jumplab.auditing import AuditReport, ClipReport
+    from jumplab.auditing import AuditReport
     from jumplab.show.viewer import Page
     from jumplab.sim import Perturbation, Ranges, Scene, SimulationResult
     from jumplab.studies.atlas import Atlas
-    from jumplab.studies.mend import Mended
 
 
 class Saved(NamedTuple):
@@ -72,8 +71,8 @@ def plan(
     contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of
         your own; or the words of :meth:`Contacts.named`, such as "hop=0.2". It is planned by the
         whole-body program, and audited foot by foot.
-    like : a clip, what :func:`judge` takes or returned of it, in whose manner the target is to be
-        reached: one flight off both feet and down on both, on level ground.
+    like : a clip, as :func:`jumplab.judge` takes or returns it, in whose manner the target is to
+        be reached: one flight off both feet and down on both, on level ground.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
     method : "direct" (the whole body alone) or, for targets in the plane, "three-step" (SRMP,
         joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step"
@@ -147,68 +146,6 @@ def audit(plan: JumpPlan) -> AuditReport:
     and nothing of the planner: :attr:`jumplab.JumpPlan.audit`, made once.
     """
     return plan.audit
-
-
-@checked
-def judge(
-    motion: Any,
-    robot: Robot | str | Path = "bhr",
-    *,
-    fps: float | None = None,
-    order: str = "depth-first",
-) -> ClipReport | list[ClipReport]:
-    """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
-    fall, unphysical forces, motors, joints, collisions.
-
-    Returns a report, of several clips a list. Raises :class:`InputError` for what holds no clip of
-    the robot.
-
-    Parameters
-    ----------
-    motion : a plan or a simulation; or the path of a clip (pickles of motion libraries and
-        retargeters, npz, csv, told by their content; pickles are read without running them), or of
-        a folder of clips.
-    robot : whose motion it is, if it does not carry its own: what :meth:`Robot.load` takes. Of a
-        clip with more joints than it moves, the shipped robot of the same URDF that has those.
-    fps : frame rate of files that do not say [1/s].
-    order : of joints without names, "depth-first" or "breadth-first".
-    """
-    from jumplab.auditing.clip import judge as judged
-
-    return judged(motion, robot, fps=fps, order=order)
-
-
-@checked
-def mend(
-    motion: Any,
-    robot: Robot | str | Path = "bhr",
-    *,
-    fps: float | None = None,
-    order: str = "depth-first",
-    weights: Mapping[str, float] | None = None,
-    limits: Limits | Mapping[str, Any] | None = None,
-) -> Mended:
-    """The nearest motion to a clip that the robot can do: the clip's contacts, all limits hard.
-
-    Parameters
-    ----------
-    motion : one clip, as of :func:`judge`, or what that returned of it.
-    robot, fps, order : as there.
-    weights, limits : as of :class:`jumplab.Planner`.
-
-    Returns
-    -------
-    Mended
-        ``.plan`` is a plan as any other, ``.changes`` a table of what became of the clip.
-
-    Raises
-    ------
-    InputError, InfeasibleError
-        If there is no clip, or no motion near it; then with the largest part that can be done.
-    """
-    from jumplab.studies.mend import mend as mended
-
-    return mended(motion, robot, fps=fps, order=order, weights=weights, limits=limits)
 
 
 @checked

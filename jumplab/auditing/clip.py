@@ -81,20 +81,27 @@ def phases_of(ground: np.ndarray, fps: float) -> list[tuple[str, float, float]]:
 
 @checked
 def judge(
-    motion: Any, robot: Robot | str = "bhr", *, fps: float | None = None, order: str = "depth-first"
+    motion: Any,
+    robot: Robot | str | Path = "bhr",
+    *,
+    fps: float | None = None,
+    order: str = "depth-first",
 ) -> ClipReport | list[ClipReport]:
-    """Judge a motion: float, penetration, slip, flights against free fall, unphysical forces,
-    motors, joints, collisions.
+    """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
+    fall, unphysical forces, motors, joints, collisions.
 
     Returns a report, of a folder and of a file with several clips a list of them. Raises
     :class:`InputError` for what holds no clip of the robot.
 
     Parameters
     ----------
-    motion : a plan, tape or simulation; a :class:`.Clip`; the path of a file as of
-        :func:`.read_clips`, or of a folder of such files.
-    robot : whose motion it is, if it does not carry its own.
-    fps, order : as of :func:`.read_clips`.
+    motion : a plan, tape or simulation; a :class:`.Clip`; or the path of a clip (pickles of motion
+        libraries and retargeters, npz, csv, told by their content; pickles are read without running
+        them), or of a folder of clips.
+    robot : whose motion it is, if it does not carry its own: what :meth:`Robot.load` takes. Of a
+        clip with more joints than it moves, the shipped robot of the same URDF that has those.
+    fps : frame rate of files that do not say [1/s].
+    order : of joints without names, "depth-first" or "breadth-first".
     """
     if isinstance(motion, Clip):
         return _judged(motion)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,18 +113,22 @@ class Mended(Shown):
 @checked
 def mend(
     motion: Any,
-    robot: Robot | str = "bhr",
+    robot: Robot | str | Path = "bhr",
     *,
     fps: float | None = None,
     order: str = "depth-first",
-    **changes: Any,
+    weights: Mapping[str, float] | None = None,
+    limits: Limits | Mapping[str, Any] | None = None,
 ) -> Mended:
-    """The nearest motion to a clip that its robot can do.
+    """The nearest motion to a clip that its robot can do: the clip's contacts, all limits hard.
+
+    Its ``.plan`` is a plan as any other, ``.changes`` a table of what became of the clip.
 
     Parameters
     ----------
-    motion, robot, fps, order : as of :func:`jumplab.judge`, one clip.
-    changes : ``weights``, ``limits`` and so on, as of :class:`jumplab.Planner`.
+    motion : one clip, as of :func:`jumplab.judge`, or what that returned of it.
+    robot, fps, order : as there.
+    weights, limits : as of :class:`jumplab.Planner`.
 
     Raises
     ------
@@ -134,7 +139,7 @@ def mend(
         clip (in way, turn and height) that can be done.
     """
     before = _judged(motion, robot, fps, order)
-    planner = Planner(before.clip.robot, keep=True, **changes)
+    planner = Planner(before.clip.robot, keep=True, weights=weights, limits=limits)
     try:
         return _mended(planner, before)
     except SolverError as e:

@@ -114,10 +114,12 @@ def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure
         ax, body, frames[order], [PHASE_COLORS[phases[k]] for k in order], shifts=np.array(shifts)[order],
         strengths=[PALE if phases[k] == "flight" else 1.0 for k in order],
     )  # fmt: skip
+    trunks = [np.vstack([o for part, o in frame if part == "trunk"])[:, 0] for frame in outlines]
     for row, shift, phase, frame in zip(rows, shifts, phases, outlines, strict=True):
         trunk = np.vstack([o for part, o in frame if part == "trunk"])
         x, z = trunk[np.argmax(trunk[:, 1])]
-        if phase == "launch" and shift == 0:  # its outline shows through a robot that lands in front of it
+        behind = any(trunks[k].min() < trunk[:, 0].max() for k, name in enumerate(phases) if name == "landing")
+        if phase == "launch" and shift == 0 and behind:  # its outline shows through the robot that lands before it
             edge = dict(facecolor="none", edgecolor=shade(LAUNCH, 0.55), linewidth=0.7, zorder=5)
             for _, outline in frame:
                 ax.add_patch(Polygon(outline, closed=True, **edge))

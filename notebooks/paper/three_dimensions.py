@@ -165,7 +165,7 @@ def perturbed(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def maps(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    """Targets to the side and with a turn: cost of the plan as a multiple of the least there, and the limit used most."""
+    """Targets to the side and with a turn: cost as a multiple of the least there, and the limit used most."""
     fig = new_figure(PAGE_IN, 3.1)
     axes = fig.subplots(1, 2)
     for ax, kind, (i, j), ticks in zip(
