@@ -31,6 +31,7 @@ from jumplab.studies.chain import Course
 from jumplab.studies.trials import TrialSettings
 
 Row = dict[str, str]
+COMMANDS_S = 90  # processor time of all commands on a damaged folder
 LONGEST_S = 4  # processor time of a call, after which it counts as taken
 MEMORY_BYTES, MOST_CHARACTERS = 4 << 30, 300  # of the process; of a message
 MORE = [float("nan"), float("inf"), -1.0, -3, True, [], (), "left", "\0", Path("/dev/null"), np.zeros(0), np.float32(2),
@@ -51,7 +52,7 @@ OPTIONS = {
 }  # fmt: skip
 
 
-def forked(work: Callable[[], Row], folder: Path) -> Row:
+def forked(work: Callable[[], Row], folder: Path, longest_s: int = LONGEST_S) -> Row:
     """What ``work`` returns in a process of its own; one that dies of its time is "long", of anything else "dead"."""
     reading, writing = os.pipe()
     child = os.fork()
@@ -59,7 +60,7 @@ def forked(work: Callable[[], Row], folder: Path) -> Row:
         with contextlib.suppress(BaseException):
             os.chdir(folder)
             used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-            resource.setrlimit(resource.RLIMIT_CPU, (int(used) + LONGEST_S, int(used) + LONGEST_S))
+            resource.setrlimit(resource.RLIMIT_CPU, (int(used) + longest_s, int(used) + longest_s))
             nowhere = os.open(os.devnull, os.O_RDWR)
             os.dup2(nowhere, 1)
             os.dup2(nowhere, 2)
@@ -148,7 +149,9 @@ def folders(folder: Path) -> Callable:
             commands.append(["export", "jump", "--format", name, "--out", out, *simulated])
         rng.shuffle(commands)
         commands.append(["simulate", "jump"] if number % 10 == 0 else ["audit", "jump"])
-        row = forked(lambda: ends(commands, place), place)
+        row = forked(lambda: ends(commands, place), place, COMMANDS_S)
+        if row["end"] == "long":
+            row["fault"] = f"more than {COMMANDS_S} s"
         if not row["fault"]:
             shutil.rmtree(place)
         return {"damage": what} | row

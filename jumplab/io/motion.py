@@ -93,8 +93,10 @@ class Motion:
         along the arc.
 
         An instant that stands twice gives its later sample, so that take-off belongs to the flight.
-        Raises :class:`InputError` if a time lies outside the motion.
+        Raises :class:`InputError` if a time lies outside the motion, or a quaternion is zero.
         """
+        if not np.all(np.any(self.q[:, 3:7], axis=1)):
+            raise InputError("a quaternion of the base is zero, which is no attitude; make it anew")
         times = np.asarray(times, float)
         if len(times) and not (
             self.t[0] <= times.min() and times.max() <= self.t[-1] + END_TOLERANCE
