@@ -234,7 +234,9 @@ def print_summary(summary: Mapping[str, Any]) -> None:
     """Cost of the stages and what was planned."""
     columns = ("stage", "iterations", "build_s", "solve_s")
     print(jl.plots.table(summary["stages"], columns, decimals=2))
-    if summary["method"] == "three-step" and all(x["stage"][0] != "2" for x in summary["stages"]):
+    if summary.get("method") == "three-step" and all(
+        x["stage"][0] != "2" for x in summary["stages"]
+    ):
         print("without stage 2, which follows no flip")
     line = "planned: distance {planned_distance_m:.3f} m, rise {planned_rise_m:.3f} m"
     if summary.get("planned_side_m") is not None:
