@@ -185,6 +185,19 @@ def test_ground_gives_way_by_what_was_said(engine, bhr):
     assert contacts.wrench[:, 2].sum() == pytest.approx(42 * 9.8, rel=0.02)
 
 
+def test_soft_ground_throws_nobody_up(engine, bhr):
+    q, soft_m = stance_configuration(bhr), 0.001
+    scene = Scene("soft", (replace(Scene.flat().blocks[0], soft_m=soft_m),))
+    hold, start = Hold(bhr, q), scene.seated(bhr, q)
+    start[2] += 0.02
+    with engine(bhr, start, scene=scene, contact="usual") as world:
+        heights = []
+        for _ in range(300):
+            hold.step(world)
+            heights.append(world.state()[0][2])
+    assert max(heights) < start[2] + 1e-3 and heights[-1] < q[2]
+
+
 def test_a_shove_is_timed_by_the_plan_and_known_to_the_checks(bhr):
     end, takeoff = float(tape().t[-1]), tape().takeoff_time
     shoves = tuple(Shove(phase, 1.0, 15.0, np.pi / 2) for phase in ("launch", "flight", "landing"))

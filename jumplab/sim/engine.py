@@ -83,9 +83,9 @@ class Engine(ABC):
         contact: str | Any = CONTACTS[0],
     ):
         self.robot = robot
-        self.contact = self.contact_of(contact)
         self._contact_name = contact if isinstance(contact, str) else str(contact)
         self.scene = scene or Scene.flat()
+        self.contact = self.contact_of(contact, self.scene)
         # where ground has pressed on feet: what each step noted for :meth:`_sole_points`
         self._pressed: list[tuple[np.ndarray, ...]] = []
         try:
@@ -104,8 +104,10 @@ class Engine(ABC):
         self.close()
 
     @classmethod
-    def contact_of(cls, contact: Any) -> Any:
-        """A contact by its name, or as it is; raises :class:`InputError` if it is none."""
+    def contact_of(cls, contact: Any, scene: Scene | None = None) -> Any:
+        """A contact by its name, or as it is, for the ground of a ``scene``; raises
+        :class:`InputError` if it is none.
+        """
         if isinstance(contact, str) and contact in cls.known:
             return cls.known[contact]
         if not isinstance(contact, type(cls.known[CONTACTS[0]])):

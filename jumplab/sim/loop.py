@@ -62,7 +62,7 @@ class Run:
         self.hardware = Hardware(
             delay_s=self.perturbation.known_delay_s,
             force_noise_n=self.perturbation.noise.force,
-            substeps=kind.contact_of(contact).substeps,
+            substeps=kind.contact_of(contact, self.ground).substeps,
         )
         self.rows: list[Row] = []
 

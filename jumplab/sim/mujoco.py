@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -13,7 +13,7 @@ from jumplab.control.kinematics import rotation
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.engine import Engine, Kept, inertial, moment
-from jumplab.sim.scene import REACH_M, Contacts
+from jumplab.sim.scene import REACH_M, Contacts, Scene
 
 # MuJoCo would write its warnings into a file of the working folder
 mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
@@ -73,6 +73,16 @@ class MujocoEngine(Engine):
     keeps_com = False
     known: ClassVar = {"hard": HARD, "usual": Contact()}
     contact: Contact
+
+    @classmethod
+    def contact_of(cls, contact: Any, scene: Scene | None = None) -> Contact:
+        """As of every engine; springs of soft ground throw feet up in longer steps, and their ratio
+        of friction is none for a pyramid.
+        """
+        found = super().contact_of(contact)
+        if scene and any(block.soft_m for block in scene.blocks):
+            return replace(found, substeps=max(found.substeps, HARD.substeps), elliptic=True)
+        return found
 
     def _build(self, friction: float) -> None:
         spec = self._read()
