@@ -105,12 +105,8 @@ class LandingPlan(SrmpStance):
         """CoM (2,), its velocity (2,) and L at ``time`` since touchdown; the last sample holds for
         ever.
         """
-        now = self._at(time, self.com, self.com_velocity, self.L)
+        now = _at(time, self.t, self.com, self.com_velocity, self.L)
         return now[:2], now[2:4], float(now[4])
-
-    def _at(self, time: float, *columns: np.ndarray) -> np.ndarray:
-        """Columns (n,) or (n, 2) at a ``time``, one after the other."""
-        return np.array([np.interp(time, self.t, x) for x in np.column_stack(columns).T])
 
     def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
         """CoM acceleration (2,) [m/s^2] and dL/dt [N m] at ``time`` since touchdown; zero once the
@@ -121,8 +117,13 @@ class LandingPlan(SrmpStance):
         """
         if time >= self.t[-1]:
             return np.zeros(2), 0.0
-        now = self._at(time, self.com_acceleration, self.L_rate)
+        now = _at(time, self.t, self.com_acceleration, self.L_rate)
         return now[:2], float(now[2])
+
+
+def _at(time: float, t: np.ndarray, *columns: np.ndarray) -> np.ndarray:
+    """Columns (n,) or (n, 2) over ``t`` (n,) at a ``time``, one after the other."""
+    return np.array([np.interp(time, t, x) for x in np.column_stack(columns).T])
 
 
 def landing_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term]:
