@@ -208,6 +208,7 @@ def test_processes_and_threads_do_everything_at_once(tmp_path, monkeypatch):
     """A solver, an engine, a folder and the processes of a study are each shared by threads: results are equal."""
     monkeypatch.setattr("together.ROUND_S", 5.0)
     monkeypatch.setattr("together.PROCESSES", 2)
+    monkeypatch.setattr("together.WORKS", ("shared planner", "another", "bullet", "mujoco", "folder", "figure"))
     row = together(tmp_path)(0, random.Random(1))
     assert not row["fault"] and row["calls"] >= 8, row
 

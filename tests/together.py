@@ -21,6 +21,7 @@ import jumplab as jl
 from jumplab.studies.envelope import envelope
 
 PROCESSES, THREADS, ROUND_S = 4, 4, 60.0
+WORKS: tuple[str, ...] = ()  # names of those that are done, all if there are none
 TARGETS = jl.JumpTask(0.3, 0.2), jl.JumpTask(0.4, 0.3), jl.JumpTask(0.2, 0.2, side_m=0.1)
 
 
@@ -58,6 +59,7 @@ class Works:
             "trials": (self.tried, 15),
             "map": (self.mapped, 8),
         }
+        self.all = {name: self.all[name] for name in WORKS or self.all}
 
     def written(self) -> str:
         """One folder that everybody writes and reads."""

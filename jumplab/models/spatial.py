@@ -184,9 +184,9 @@ class SpatialModel:
         angles, rates, gains = (x[:, 3:6] for x in (q, v, a))
         turn = _rotation().from_euler("ZXY", angles)  # its quaternions follow whole turns
         slope, change = _slopes(angles), _slopes(angles, rates)
-        speed = turn.apply(v[:, :3], inverse=True)
+        speed = turn.apply(np.array(v[:, :3]), inverse=True)
         spin = _times(slope, rates)
-        accel = turn.apply(a[:, :3], inverse=True) - np.cross(spin, speed)
+        accel = turn.apply(np.array(a[:, :3]), inverse=True) - np.cross(spin, speed)
         turning = _times(slope, gains) + _times(change, rates)
         configurations = np.hstack([q[:, :3], turn.as_quat(), q[:, 6:]])
         twists = np.hstack([speed, spin, v[:, 6:]])
@@ -200,7 +200,8 @@ class SpatialModel:
         ``near`` (3,)."""
         chart = self.of_pinocchio(q, near)
         turn = _rotation().from_quat(q[:, 3:7])
-        speed, spin = v[:, :3], v[:, 3:6]
+        speed = np.array(v[:, :3])  # SciPy turns no read-only arrays
+        spin = v[:, 3:6]
         back = np.linalg.inv(_slopes(chart[:, 3:6]))
         rates = _times(back, spin)
         gains = _times(back, a[:, 3:6] - _times(_slopes(chart[:, 3:6], rates), rates))
