@@ -59,7 +59,7 @@ COMMANDS = {
     "atlas": ("atlas --distance-m 0.3,0.4 --height-m 0.2 --jobs 2 --out new", 8),
     "sweep": ("sweep --distance-m 0.3,0.4 --height-m 0.2 --jobs 2 --tapes 50 --out new", 8),
     "bench": ("bench --repeats 1 --distance-m 0.4 --height-m 0.2 --out new.json", 10),
-    "run": ("run 00 -p fast=true --out new", 20),
+    "run": ("run 00 --out new", 20),
     "list": ("robot list", 0.3),
     "check": ("robot check g1 --out new", 3),
     "completion": ("completion bash", 0.2),
