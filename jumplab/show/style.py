@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import ContextDecorator, ExitStack
 from importlib import resources
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -70,16 +71,19 @@ class Style(ContextDecorator):
     """The style, as a decorator or in a ``with`` block.
 
     ``whole`` whatever the caller's settings are, else with those that differ from Matplotlib's
-    defaults left as they are.
+    defaults left as they are. Settings are the whole process's, so threads take turns.
     """
+
+    _turn = RLock()
 
     def __init__(self, whole: bool):
         self._whole = whole
         self._open: list[ExitStack] = []
 
     def __enter__(self) -> None:
-        own = {} if self._whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
         stack = ExitStack()
+        stack.enter_context(self._turn)
+        own = {} if self._whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
         stack.enter_context(plt.style.context(STYLE_FILE))
         larger = own.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
         for key in (key for key in TEXT_SIZES if key not in own):
