@@ -205,10 +205,10 @@ def test_workers_import_nothing_from_the_current_folder(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_processes_and_threads_do_everything_at_once(tmp_path, monkeypatch):
-    """A solver, an engine, a folder and the processes of a study are each shared by threads: results are equal."""
+    """A planner and engines are shared by threads of two processes: results are equal."""
     monkeypatch.setattr("together.ROUND_S", 5.0)
     monkeypatch.setattr("together.PROCESSES", 2)
-    monkeypatch.setattr("together.WORKS", ("shared planner", "another", "bullet", "mujoco", "folder", "figure"))
+    monkeypatch.setattr("together.WORKS", ("shared planner", "another", "bullet", "mujoco", "page"))
     row = together(tmp_path)(0, random.Random(1))
     assert not row["fault"] and row["calls"] >= 8, row
 
