@@ -11,7 +11,6 @@ import pinocchio as pin
 from jumplab.auditing.replay import Replay, carrying, norm, runs
 from jumplab.auditing.report import METHOD, Measure
 from jumplab.io.tape import Tape
-from jumplab.robot.reduction import EXACT_M, mirror
 from jumplab.task import JumpTask
 
 
@@ -80,22 +79,43 @@ def switch(r: Replay) -> Iterator[Measure]:
             yield f"{kind} at the switch", np.abs(jumps), tape.t[at], r.coordinates
 
 
+def mirror(model: pin.Model) -> tuple[np.ndarray, np.ndarray] | None:
+    """For each joint (nv - 6,), the index of the one that mirrors it in the x-z plane, and the sign
+    of its angle.
+
+    Found from the geometry in the neutral pose, not from names. None if a joint has no counterpart.
+    """
+    data = model.createData()
+    # world axes, since the base is neutral
+    axes = pin.computeJointJacobians(model, data, pin.neutral(model))[3:, 6:].T
+    places = np.array([place.translation for place in data.oMi[2:]])
+    flip = np.array([1.0, -1.0, 1.0])
+    near = norm(flip * places[:, None] - places) < 2e-6
+    along = (-flip * axes) @ axes.T  # an axial vector mirrors with the opposite sign
+    alike = near & (np.abs(along) > 1 - 1e-6)
+    if not alike.any(axis=1).all():
+        return None
+    other = alike.argmax(axis=1)
+    return other, np.sign(along[np.arange(len(other)), other])
+
+
 def symmetry(r: Replay) -> Iterator[Measure]:
     """Left against right, of a jump in the plane."""
     if not (r.robot.planar and r.is_jump and (r.task is None or r.task.in_plane)):
         return
     tape = r.tape
-    pairs = mirror(r.model, EXACT_M)  # of all joints, as the robot is planar
-    joints = [r.joints[one] for one, _, _ in pairs]
+    other, sign = mirror(r.model)
+    angles = tape.q[:, 7:]
     peak = r.model.upperEffortLimit[6:]
-    posture = [tape.q[:, 7 + k] - sign * tape.q[:, 7 + i] for i, k, sign in pairs]
-    posture += [tape.q[:, 1] - tape.q[0, 1], 2 * tape.q[:, 3], 2 * tape.q[:, 5]]
-    effort = [(tape.tau[:, k] - sign * tape.tau[:, i]) / peak[k] for i, k, sign in pairs]
+    shift = tape.q[:, 1] - tape.q[0, 1]
+    out_of_plane = np.column_stack([shift, 2 * tape.q[:, 3], 2 * tape.q[:, 5]])
+    posture = np.hstack([angles[:, other] - sign * angles, out_of_plane])
+    torque = (tape.tau[:, other] - sign * tape.tau) / peak[other]
     forces = [tape.f[..., 1].sum(axis=1), np.ptp(tape.f[..., 2], axis=1)]
-    effort += [force / r.weight for force in forces]
+    effort = np.column_stack([torque, *np.divide(forces, r.weight)])
     base = ("lateral shift", "roll", "yaw")
-    yield "left/right posture", np.abs(posture).T, tape.t, (*joints, *base)
-    yield "left/right effort", np.abs(effort).T, tape.t, (*joints, "lateral force", "foot load")
+    yield "left/right posture", np.abs(posture), tape.t, (*r.joints, *base)
+    yield "left/right effort", np.abs(effort), tape.t, (*r.joints, "lateral force", "foot load")
 
 
 def target(r: Replay) -> Iterator[Measure]:

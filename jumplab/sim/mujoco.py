@@ -76,8 +76,8 @@ class MujocoEngine(Engine):
 
     @classmethod
     def contact_of(cls, contact: Any, scene: Scene | None = None) -> Contact:
-        """As of every engine; springs of soft ground throw feet up in longer steps, and their ratio
-        of friction is none for a pyramid.
+        """As of every engine; springs of soft ground need steps as short as those of hard contacts,
+        and an elliptic cone at their ratio of friction.
         """
         found = super().contact_of(contact)
         if scene and any(block.soft_m for block in scene.blocks):
@@ -132,15 +132,19 @@ class MujocoEngine(Engine):
 
         A contact's force is share / (1 - share) / inverse mass times its reference acceleration, -b
         v - k r. The inverse mass is the engine's own of a foot: under other links the ground is as
-        much harder as they are heavier.
+        much harder as they are heavier. Where four points damp a foot by more than all of its speed
+        within a step, it would be thrown up: ground is at least as soft as that (0.3 mm).
         """
         model = self._model
         inverse = float(np.mean([model.body_invweight0[body, 0] for body in self._feet]))
+        stiffest = self.robot.total_mass * inverse * model.opt.timestep  # [s]
+        least_m = self.robot.gravity * stiffest**2
         for geom, block in zip(
             np.flatnonzero(model.geom_bodyid == 0), self.scene.blocks, strict=True
         ):
             if block.soft_m:
-                k, b = np.array(self.spring(block.soft_m)) * inverse * (1 - SOFT_SHARE) / SOFT_SHARE
+                spring = np.array(self.spring(max(block.soft_m, least_m)))
+                k, b = spring * inverse * (1 - SOFT_SHARE) / SOFT_SHARE
                 # by which the engine divides
                 model.geom_solref[geom] = [-k * SOFT_SHARE, -b * SOFT_SHARE]
                 model.geom_solimp[geom, :2] = SOFT_SHARE
