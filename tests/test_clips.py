@@ -115,6 +115,7 @@ def test_a_stopped_library_goes_on(world, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         clips.make_clips(robot, tmp_path, jobs=1, say=stop)
     assert len(world.calls) == 1 and not (tmp_path / "index.json").exists()
+    assert not (tmp_path / ".staging").exists()
     found = clips.make_clips(robot, tmp_path, jobs=1, say=said.append)
     assert len(found["clips"]) == 2 and len(world.calls) == 2 and said == ["forward-1: passed", "forward-2: passed"]
     other = clips.make_clips(robot, tmp_path, "unitree-csv", jobs=1)  # another format of the same simulations

@@ -49,13 +49,13 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
                 new[name][what] = robot.actuators[name][what] * factor
     signs = {name: sign for name, _, sign in robot.role_signs()}
     for key, names in _joints(robot, ranges, "the ranges"):
-        told = ranges[key]
-        if not (isinstance(told, Mapping) and told and set(told) <= set(UNITS)):
+        asked = ranges[key]
+        if not (isinstance(asked, Mapping) and asked and set(asked) <= set(UNITS)):
             raise robot.error(
                 f"the limits of {key!r} are lower, upper [rad], effort [N m], speed [rad/s], got "
-                f"{quoted(told)}"
+                f"{quoted(asked)}"
             )
-        for end, value in told.items():
+        for end, value in asked.items():
             what = f"{end} of {key!r} [{UNITS[end]}]"
             value = _number(robot, what, value, positive=end not in ENDS)
             for name in names:

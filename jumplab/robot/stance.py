@@ -196,8 +196,8 @@ def rest_angles(robot: Robot) -> np.ndarray:
     low = robot.limits.lower
     high = robot.limits.upper
     room = np.minimum(2 * STANCE_ROOM_RAD, (high - low) / 3)
-    told = [robot.rest.get(name, 0.0) for name in robot.joint_names]
-    return np.clip(told, low + room, high - room)
+    angles = [robot.rest.get(name, 0.0) for name in robot.joint_names]
+    return np.clip(angles, low + room, high - room)
 
 
 def standing(robot: Robot) -> np.ndarray:

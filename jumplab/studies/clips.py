@@ -117,12 +117,14 @@ def make_clips(
         "fps": fps,
     }
     with made(out), locked(out, wait_s=0.0):  # one library at a time
-        for row in in_parallel(work, jobs, "generator"):
-            rows[row["passed"]].append(row)
-            words = "passed" if row["passed"] else f"left out, {row['reasons'][0]}"
-            say(f"{row['name']}: {words}")
+        try:
+            for row in in_parallel(work, jobs, "generator"):
+                rows[row["passed"]].append(row)
+                words = "passed" if row["passed"] else f"left out, {row['reasons'][0]}"
+                say(f"{row['name']}: {words}")
+        finally:
+            shutil.rmtree(out / STAGING, ignore_errors=True)
         clips = {"clips": rows[True], "left_out": rows[False]}
-        shutil.rmtree(out / STAGING, ignore_errors=True)
         store.settle()
         store.write_file(out / INDEX, store.to_json(head | clips).encode())
     return clips

@@ -177,7 +177,9 @@ class Schedule:
             terms += touchdown_rows(m)
         met = [x for x in self.apart if x.phase == k]
         terms += [link_distance(m, x, phases[k].intervals) for x in met]
-        return [*terms, *(largest(name) for name in self.sought[:last])]
+        if last and self.sought:
+            terms.append(largest(self.sought[0]))
+        return terms
 
     def _phase(self, k: int) -> Phase:
         mode = self.modes[k]
