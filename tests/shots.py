@@ -28,6 +28,7 @@ from jumplab.cli import main as cli
 from jumplab.io import folder as store
 
 ROOT = Path(__file__).resolve().parent.parent
+URDF = ROOT / "tests" / "mini.urdf"
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
 LOGS = ".jsonl"  # finished pieces of work are kept
 LOOK_S, FAMILY = 0.01, 10  # children are looked for at every tenth look
@@ -61,7 +62,7 @@ COMMANDS = {
     "bench": ("bench --repeats 1 --distance-m 0.4 --height-m 0.2 --out new.json", 10),
     "run": ("run 00 --out new", 20),
     "list": ("robot list", 0.3),
-    "check": ("robot check g1 --out new", 3),
+    "check": (f"robot check {URDF} --out new", 3),
     "completion": ("completion bash", 0.2),
 }
 

@@ -271,6 +271,7 @@ def test_a_solve_without_memory_ends(bhr, more_mb, monkeypatch):
     assert ended(lambda: jl.plan(jl.JumpTask(0.4, 0.3), bhr) and 0, AS=used, CPU=cpu_s) in (0, 3, 4)
 
 
+URDF = ROOT / "tests" / "mini.urdf"
 STREAMS = [
     ("robot list > /dev/full", 4, None),
     ("robot list >&-", 0, None),
@@ -278,14 +279,14 @@ STREAMS = [
     ("robot list | true", 0, None),
     ("plan --distance-m x --out p 2>&-", 2, None),
     ("plan --distance-m x --out p 2> /dev/full", 2, None),
-    ("robot check g1 --out new <&- >&- 2>&-", 0, "new/g1.txt"),
-    ("robot check g1 --out new > /dev/full 2> /dev/full", 4, "new/g1.txt"),
+    (f"robot check {URDF} --out new <&- >&- 2>&-", 0, "new/mini.txt"),
+    (f"robot check {URDF} --out new > /dev/full 2> /dev/full", 4, "new/mini.txt"),
     ("envelope --distance-m 0.3,0.4 --height-m 0.2 --jobs 2 --out map <&- >&- 2>&-", 0, "map/envelope.json"),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("line", "code", "made"), STREAMS)
+@pytest.mark.parametrize(("line", "code", "made"), STREAMS, ids=range(len(STREAMS)))
 def test_streams_change_nothing(tmp_path, line, code, made):
     """Closed, full or without a reader: the work is done, and its exit code is that of the page of commands."""
     shell = f"set -o pipefail; '{sys.executable}' -m jumplab {line}"
