@@ -413,7 +413,7 @@ def test_a_stopped_study_goes_on(tmp_path, monkeypatch):
         return {"number": case.number, "method": method}
 
     monkeypatch.setattr(hard_cases, "solve", solve)
-    monkeypatch.setattr("paper.logs.code", lambda: {"sim": "0"})  # reading all sources takes seconds
+    monkeypatch.setattr("paper.logs.code", lambda: {"sim/a.py": "0"})  # reading all sources takes seconds
     hard_cases.run(tmp_path / "log", asked[:1])
     rows = hard_cases.run(tmp_path / "log", asked)
     assert solved == [(0, "three-step"), (0, "direct"), (1, "three-step"), (1, "direct")]

@@ -9,7 +9,7 @@ from paper import logs
 @pytest.fixture
 def now(monkeypatch):
     """The code of now, which a test may change."""
-    code = {room: "00000000" for room in logs.ROOMS}
+    code = {f"{room}/a.py": "00000000" for room in logs.ROOMS}
     monkeypatch.setattr(logs, "code", lambda: dict(code))
     return code
 
@@ -26,9 +26,10 @@ def test_a_digest_changes_with_code_alone(tmp_path):
     for name, (code, values) in written.items():
         module.write_text(code)
         numbers.write_text(values)
-        found[name] = logs.digest([module, numbers])
+        found[name] = logs.digest(module), logs.digest(numbers)
     assert found["as it is"] == found["the same"] and len(set(found.values())) == 3, found
-    assert set(logs.code()) == set(logs.ROOMS) and len(set(logs.code().values())) == len(logs.ROOMS)
+    assert {file.split("/")[0] for file in logs.code()} == set(logs.ROOMS)
+    assert {"stages/planner.py", "auditing/limits.toml"} <= set(logs.code())
 
 
 def test_rows_of_other_code_are_told(tmp_path, now, bhr):
@@ -39,15 +40,16 @@ def test_rows_of_other_code_are_told(tmp_path, now, bhr):
         with logs.keep(path, lambda row: row["n"], robot=bhr) as log:
             assert sorted(log.done) == list(range(n))
             log.add({"n": n})
-        now[room] = f"0000000{n}"
-    now["stages"] = "00000002"
+        now[f"{room}/a.py"] = f"0000000{n}"
+    now["stages/a.py"] = "00000002"
+    now["stages/new.py"] = "00000001"  # none of the rows can have used it
     assert logs.rows(path, said.append) == [{"n": n} for n in range(4)]
     assert said == [
-        "log.jsonl: 1 of 4 rows are of the code of now; 2 OLD, since when stages, sim changed; "
+        "log.jsonl: 1 of 4 rows are of the code of now; 2 OLD, since when sim/a.py, stages/a.py changed; "
         "1 OLD, of code that put no stamp on them"
     ]
     made = logs.lines(path)[-1][1]
-    assert made["robot"] == f"bhr {bhr.hash}" and made["code"]["sim"] == "00000001" and "cores" in made["machine"]
+    assert made["robot"] == f"bhr {bhr.hash}" and made["code"]["sim/a.py"] == "00000001" and "cores" in made["machine"]
     with logs.keep(path, lambda row: row["n"]):
         pass
     assert len(path.read_text().splitlines()) == 7  # nothing was added: no stamp either

@@ -25,6 +25,7 @@ Row = dict[str, Any]
 # rooms whose code decides what a study finds; a reading, a picture or a command does not
 ROOMS = ("robot", "models", "ocp", "stages", "auditing", "control", "sim", "studies")
 STAMP = "stamp"
+NAMED = 3  # changed files in a line
 
 
 # ---------------------------------------------------------------------------------------------- stamps
@@ -32,22 +33,20 @@ STAMP = "stamp"
 
 @cache
 def code() -> dict[str, str]:
-    """Room of the library -> digest of what its sources do: comments, docstrings and layout do not count."""
+    """File of the library, ``room/name.py`` -> digest of what it does: comments, docstrings and layout do not count."""
     root = Path(jumplab.__file__).parent
-    return {room: digest(sorted(p for p in (root / room).rglob("*") if p.suffix in (".py", ".toml"))) for room in ROOMS}
+    files = sorted(p for room in ROOMS for p in (root / room).rglob("*") if p.suffix in (".py", ".toml"))
+    return {path.relative_to(root).as_posix(): digest(path) for path in files}
 
 
-def digest(paths: Iterable[Path]) -> str:
-    """Eight digits that change with the code of Python files, or with the values of TOML files."""
-    seen = hashlib.sha256()
-    for path in paths:
-        text = path.read_text(encoding="utf-8")
-        if path.suffix == ".toml":
-            said = repr(tomllib.loads(text))
-        else:
-            said = ast.dump(_Bare().visit(ast.parse(text)))
-        seen.update(f"{path.name}\n{said}\n".encode())
-    return seen.hexdigest()[:8]
+def digest(path: Path) -> str:
+    """Eight digits that change with the code of a Python file, or with the values of a TOML file."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".toml":
+        parts = repr(tomllib.loads(text))
+    else:
+        parts = ast.dump(_Bare().visit(ast.parse(text)))
+    return hashlib.sha256(parts.encode()).hexdigest()[:8]
 
 
 class _Bare(ast.NodeTransformer):
@@ -73,17 +72,21 @@ def stamp(folder: str | Path | None = None, robot: Robot | None = None) -> Row:
 
 
 def age(stamps: Iterable[Mapping[str, Any] | None]) -> str:
-    """How many rows, each given by its stamp or None, are of the code of now, and what changed since the others."""
-    stamps = list(stamps)
+    """How many rows, each given by its stamp or None, are of the code of now, and what changed since the others.
+
+    A file that came later does not count: it can only matter through a change of one that was there.
+    """
+    stamps, now = list(stamps), code()
     unknown, old, changed = stamps.count(None), 0, Counter()
     for made in filter(None, stamps):
-        rooms = [room for room, now in code().items() if made["code"].get(room) != now]
-        old += bool(rooms)
-        changed.update(rooms)
+        files = [file for file, was in made["code"].items() if now.get(file) != was]
+        old += bool(files)
+        changed.update(files)
     words = [f"{len(stamps) - old - unknown} of {len(stamps)} rows are of the code of now"]
     if old:
-        rooms = [room for room in ROOMS if changed[room]]
-        words.append(f"{old} OLD, since when {', '.join(rooms)} changed")
+        named = sorted(changed)[:NAMED]
+        more = f" and {len(changed) - NAMED} more files" if len(changed) > NAMED else ""
+        words.append(f"{old} OLD, since when {', '.join(named)}{more} changed")
     if unknown:
         words.append(f"{unknown} OLD, of code that put no stamp on them")
     return "; ".join(words)
