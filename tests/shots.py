@@ -194,13 +194,17 @@ def orphans(children: list[psutil.Process]) -> list[str]:
 
 
 def shots(folder: Path, numbers: Sequence[signal.Signals]) -> Callable:
-    """Cases: one command each, every one in turn and then the quick ones more often, at a drawn moment of its work."""
+    """Cases: one command each, every one in turn and then the quick ones more often, at a drawn moment of its work.
+
+    A command that ends before its moment shows how long it really works: later moments for it are drawn within that.
+    """
     source, names = good(folder), list(COMMANDS)
+    lengths_s = {name: about_s for name, (_, about_s) in COMMANDS.items()}
     weights = [1.0 / max(1.0, about_s) for _, about_s in COMMANDS.values()]
 
     def shot(k: int, rng: random.Random) -> dict[str, Any]:
         name = names[k] if k < len(names) else rng.choices(names, weights)[0]
-        longest_s = COMMANDS[name][1] if rng.random() < 0.3 else min(SOON_S, COMMANDS[name][1])
+        longest_s = lengths_s[name] if rng.random() < 0.3 else min(SOON_S, lengths_s[name])
         number, at_s, new = rng.choice(numbers), rng.uniform(0.0, longest_s), k % 4 == 0
         place = Path(mkdtemp(prefix=f"shot-{k}-", dir=folder))
         shutil.copytree(source, place, dirs_exist_ok=True)
@@ -209,6 +213,8 @@ def shots(folder: Path, numbers: Sequence[signal.Signals]) -> Callable:
         used_s, children = run_until(process, at_s + new * START_S)
         if process.poll() is None:
             os.kill(process.pid, number)
+        else:
+            lengths_s[name] = min(lengths_s[name], max(used_s - new * START_S, LOOK_S))
         code, said = process.end()
         faults = faults_of_end(code, number, said) + orphans(children) + faults_of_folders(place)
         if number != signal.SIGKILL and code and (changed := differences(kept(content(place)), before)):
