@@ -44,7 +44,7 @@ def check(args: Namespace) -> None:
     from jumplab.robot_import.jumper import REPAIRS
     from jumplab.robot_import.urdf import described
 
-    urdf = args.urdf
+    urdf, draft = args.urdf, None
     if (urdf is None) == (args.robot_description is None):
         raise InputError(
             "jumplab robot check: name a URDF, or a robot by --robot-description; one of the two"
@@ -71,7 +71,11 @@ def check(args: Namespace) -> None:
         result = checkup.check(urdf, text)
     elif not shipped:
         draft = _draft(urdf, tuple(args.repair), args.out, args.force)
-        result = checkup.check(urdf, draft.text, draft.tree)
+        try:
+            result = checkup.check(urdf, draft.text, draft.tree)
+        except RobotError:  # the configuration is where it is mended
+            _write(args.out, draft.text, args.force)
+            raise
     elif "[source]" in shipped.read_text(encoding="utf-8"):
         result = checkup.examine(urdf)
     else:
@@ -80,12 +84,16 @@ def check(args: Namespace) -> None:
             f"check"
         )
     robot = result.robot
+    picture = jl.plots.robot_sheet(robot) if args.out else None
+    if args.out:
+        io.folder.settle()
+    if draft:
+        _write(args.out, draft.text, args.force)
     args.found |= {"robot": robot.name, "notes": result.lines(), "roles": result.rows()}
     print(*result.lines(), sep="\n")
     print(jl.plots.table(result.rows()))
     if args.out is not None:
         views = "Side view, moving joints from the front, and the five links of the sagittal plane"
-        picture = jl.plots.robot_sheet(robot)
         jl.plots.save_figure(picture, robot.name, args.out, f"{views}, standing.", robot=robot)
         print(f"picture: {Path(args.out) / robot.name}.png")
 
@@ -99,10 +107,10 @@ def robot(args: Namespace) -> None:
 
 
 def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> Draft:
-    """A URDF (path) without faults and its starter configuration; written as OUT/NAME.toml if there
-    is an ``out``.
+    """A URDF (path) without faults and its starter configuration.
 
-    Faults of limits alone do not hinder the writing: they are mended there.
+    If there are faults, and of limits alone, the configuration is written as OUT/NAME.toml: they
+    are mended there.
     """
     from jumplab.robot_import import checkup
 
@@ -114,8 +122,8 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
         for role, pair in draft.roles.joints.items() if faults else ():
             print(f"{role.replace('_', ' ')}: {', '.join(pair) or 'held'}")
         print(f"sole: {draft.sole.source}")
-        if out is not None and (not faults or draft.faults == tuple(faults)):
-            path = _write(Path(out), draft.text, force)
+        if faults and draft.faults == tuple(faults):
+            path = _write(out, draft.text, force)
     if faults:
         first, *others = faults
         print("".join(f"{sentence}\n" for sentence in others), end="")
@@ -126,13 +134,15 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
     return draft
 
 
-def _write(folder: Path, text: str, force: bool) -> Path:
+def _write(folder: str | None, text: str, force: bool) -> Path | None:
     """Write a starter configuration, but not over another one, which somebody may have edited; its
-    path.
+    path, or None without a folder.
     """
     from jumplab.robot import files
 
-    path = folder / f"{files.read_toml(text, 'starter')['name']}.toml"
+    if folder is None:
+        return None
+    path = Path(folder) / f"{files.read_toml(text, 'starter')['name']}.toml"
     content = text.encode()
     if path.exists() and not force and path.read_bytes() != content:
         raise InputError(
