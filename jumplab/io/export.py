@@ -16,17 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.io import gains
 from jumplab.io.columns import table_of
 from jumplab.io.folder import FORMATS, transaction, write_file
 from jumplab.io.motion import Motion, checked_rate
 from jumplab.io.whole import ORDERS, Whole, axes_of, ordered
 from jumplab.robot import Robot
 
-# of MuJoCo's folder: the step, the time in which a penetration fades, impedance of friction over
-# that of pressure
-MUJOCO_STEP_S = 0.001
-MUJOCO_CONTACT_S = 0.005
-MUJOCO_CONE_RATIO = 10.0
 HELD_RAD = 0.02  # by which joints that a format leaves out may move
 LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
 PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
@@ -290,11 +286,12 @@ def _qpos_qvel(x: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
-    """The robot on level ground as MuJoCo's XML, with the motors that it is planned with, and
-    ``qpos``, ``qvel``, ``ctrl`` (torques).
+    """The robot on level ground as MuJoCo's XML, with the motors that it is planned with;
+    ``qpos``, ``qvel``, ``ctrl`` (torques) and the arrays of :func:`.gains.gains`; and a script that
+    plays them.
 
-    Limits of torque are the plan's, as are armature, friction and damping of the joints. Steps are
-    short and contacts hard, or feet that land sink and slide.
+    Limits of torque are the plan's, as are armature, friction and damping of the joints. Step and
+    contacts are MuJoCo's own.
     """
     import mujoco
 
@@ -304,15 +301,8 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     spec.compiler.discardvisual = False
     spec.compiler.fusestatic = True
     spec.worldbody.first_body().add_freejoint()
-    option = spec.option
-    option.gravity = [0.0, 0.0, -whole.robot.gravity]
-    option.timestep = MUJOCO_STEP_S
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = MUJOCO_CONE_RATIO
+    spec.option.gravity = [0.0, 0.0, -whole.robot.gravity]
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
-    for geom in spec.geoms:
-        geom.solref = [MUJOCO_CONTACT_S, 1.0]
     for name in whole.joints:
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         joint = spec.joint(name)
@@ -324,17 +314,21 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
         motor.ctrlrange = joint.actfrcrange
     spec.compile()
     qpos, qvel = _qpos_qvel(x)
+    gain_time, gain = gains.gains(whole, x)
     arrays = {
         "time": x.t,
         "qpos": qpos,
         "qvel": qvel,
         "ctrl": x.tau,
+        "gain_time": gain_time,
+        "gain": gain,
         "joint_names": np.array(whole.joints),
         "contact": x.contact,
         "phase": x.phase,
         "fps": np.array(fps),
     }
-    return {"robot.xml": spec.to_xml(), "motion.npz": arrays}
+    script = (resources.files("jumplab.io") / "play.py.txt").read_text(encoding="utf-8")
+    return {"robot.xml": spec.to_xml(), "motion.npz": arrays, "play.py": script}
 
 
 CONTENTS: Mapping[str, Callable[[Whole, Motion, float], Any]] = {

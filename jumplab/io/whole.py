@@ -50,7 +50,7 @@ class Whole:
         for name in (*robot.joint_names, *self._held):
             if name not in self.joints:
                 raise RobotError(f"robot {robot.name}: [published] lacks the joint {name!r}")
-        self._order = self._columns(self.joints)
+        self.order = self._columns(self.joints)
         self._jumping = self._columns(robot.joint_names)
 
     def _columns(self, names: Iterable[str]) -> np.ndarray:
@@ -65,13 +65,13 @@ class Whole:
 
     def states(self, x: Motion) -> tuple[np.ndarray, np.ndarray]:
         """Configurations (F, nq) and velocities (F, nv) of :meth:`frames` in Pinocchio's order."""
-        back = np.argsort(self._order)
+        back = np.argsort(self.order)
         return _sorted(x.q, back), _sorted(x.v, back)
 
     def com(self, q: np.ndarray) -> np.ndarray:
         """CoM (F, 3) [m] at configurations (F, nq) of :meth:`frames`."""
         data = self.model.createData()
-        rows = _sorted(q, np.argsort(self._order))
+        rows = _sorted(q, np.argsort(self.order))
         return np.array([pin.centerOfMass(self.model, data, row).copy() for row in rows])
 
     def frames(self, motion: Motion, fps: float) -> Motion:
@@ -105,7 +105,7 @@ class Whole:
         change = np.gradient(v, x.t, axis=0) if len(x.t) > 1 else np.zeros_like(v)
         tau = np.array([pin.rnea(model, data, *row)[6:] for row in zip(q, v, change, strict=True)])
         tau[:, self._jumping] = x.tau
-        states = (_sorted(rows, self._order) for rows in (q, v, tau))
+        states = (_sorted(rows, self.order) for rows in (q, v, tau))
         return Motion(x.t - x.t[0], *states, x.phase, x.source, x.wrench, x.contact)
 
     def own(self, q: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
@@ -114,7 +114,7 @@ class Whole:
         off where they are held [rad].
         """
         data = self.model.createData()
-        state = _sorted(q, np.argsort(self._order))
+        state = _sorted(q, np.argsort(self.order))
         places = []
         for row in state:
             pin.forwardKinematics(self.model, data, row)
