@@ -17,11 +17,12 @@ from jumplab import reading
 from jumplab.errors import InputError, Shown, as_path, quoted
 from jumplab.io.columns import BASE
 from jumplab.io.motion import Motion, steady
+from jumplab.io.tensors import read_tensors
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED, read_toml
 
-ENDINGS = (".pkl", ".npz", ".csv")
+ENDINGS = (".pkl", ".npz", ".csv", ".motion")
 USUAL_FPS = 30.0  # of files that do not say
 RECORD_FPS = 100.0  # at which plans and simulations are looked at
 LEAST_FRAMES = 10
@@ -122,7 +123,8 @@ def _content(path: Path) -> Mapping[str, Any]:
     try:
         raw = reading.content(path, "clip")
         if raw[:2] == b"PK":
-            return reading.arrays(raw)
+            found = read_tensors(raw)
+            return reading.arrays(raw) if found is None else found
         if raw[:1] == b"\x80":
             return _Arrays(str(path), io.BytesIO(raw), ensure_native_byte_order=True).load()
         return _columns(raw.decode())
@@ -168,10 +170,16 @@ def _first_wxyz(x: np.ndarray) -> np.ndarray:
 
 def _of_tracker(x: Mapping[str, Any]) -> _Raw:
     joints = x["joint_pos"]
-    world = "body_names" in x and str(x["body_names"][0]) == "world"
+    world = not x["body_pos_w"][:, 0].any()
     place, turn = (x[name][:, int(world)] for name in ("body_pos_w", "body_quat_w"))
     words = "arrays of a motion tracker, quaternion w x y z"
-    return _Raw(place, _first_wxyz(turn), joints[:, 7 * world :], words)
+    root = joints.shape[1] - len(x["joint_names"]) if "joint_names" in x else 0
+    return _Raw(place, _first_wxyz(turn), joints[:, root:], words)
+
+
+def _of_states(x: Mapping[str, Any]) -> _Raw:
+    place, turn = (x[f"rigid_body_{name}"][:, 0] for name in ("pos", "rot"))
+    return _Raw(place, turn, x["dof_pos"], "states of all bodies, quaternion x y z w")
 
 
 def _of_table(x: Mapping[str, Any]) -> _Raw:
@@ -215,6 +223,7 @@ FORMS: Mapping[tuple[str, ...], Callable[[Mapping[str, Any]], _Raw] | str] = {
         "joint_position_rad",
     ): "arrays with units, quaternion x y z w",
     ("body_pos_w", "body_quat_w", "joint_pos"): _of_tracker,
+    ("rigid_body_pos", "rigid_body_rot", "dof_pos"): _of_states,
     ("base_pos_w", "base_quat_w", "joint_pos"): "base and joints, quaternion w x y z",
     ("root_translateX", "root_rotateX"): _of_animation,
     ("qpos",): "MuJoCo's qpos, quaternion w x y z",

@@ -20,6 +20,7 @@ from jumplab.io import gains
 from jumplab.io.columns import table_of
 from jumplab.io.folder import FORMATS, transaction, write_file
 from jumplab.io.motion import Motion, checked_rate
+from jumplab.io.tensors import tensor_file
 from jumplab.io.whole import ORDERS, Whole, axes_of, ordered
 from jumplab.robot import Robot
 
@@ -82,6 +83,8 @@ def _encoded(ending: str, content: Any) -> bytes:
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **content)
         return buffer.getvalue()
+    if ending == ".motion":
+        return tensor_file(content)
     return pickle.dumps(content, protocol=4) if ending == ".pkl" else content.encode()
 
 
@@ -166,18 +169,26 @@ def tracked(
     }
 
 
-def with_world(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
-    """The arrays of :func:`tracked`, velocities at centres of mass, with the world as first body
-    and the root's state before the joints', as MuJoCo's (see :func:`_qpos_qvel`).
-    """
-    arrays = tracked(whole, x, fps, at_com=True)
+def with_world(
+    whole: Whole, x: Motion, fps: float, *, at_com: bool = False
+) -> dict[str, np.ndarray]:
+    """The arrays of :func:`tracked` with the world as first body."""
+    arrays = tracked(whole, x, fps, at_com=at_com)
     for name in ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w"):
         still = np.zeros_like(arrays[name][:, :1])
         still[..., 0] = name == "body_quat_w"
         arrays[name] = np.concatenate([still, arrays[name]], axis=1)
+    return arrays | {"body_names": np.array(["world", *whole.links])}
+
+
+def with_root(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
+    """The arrays of :func:`with_world`, velocities at centres of mass, with the root's state before
+    the joints', as MuJoCo's (see :func:`_qpos_qvel`).
+    """
+    arrays = with_world(whole, x, fps, at_com=True)
     for name, state in zip(("joint_pos", "joint_vel"), _qpos_qvel(x), strict=True):
         arrays[name] = state.astype(np.float32)
-    return arrays | {"body_names": np.array(["world", *whole.links])}
+    return arrays
 
 
 def retargeted(whole: Whole, x: Motion, fps: float) -> dict[str, object]:
@@ -195,6 +206,25 @@ def retargeted(whole: Whole, x: Motion, fps: float) -> dict[str, object]:
         "contact": x.contact,
         "phase": [str(name) for name in x.phase],
         "joint_names": list(whole.joints),
+    }
+
+
+def states(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
+    """What ProtoMotions reads: joints depth-first; of all links places, rotations x y z w,
+    velocities of their origins and whether they touch the ground, as the feet do; 32-bit floats.
+    """
+    arrays = tracked(whole, x, fps)
+    touching = np.zeros(arrays["body_pos_w"].shape[:2], bool)
+    touching[:, [1 + whole.joints.index(joint) for joint, _ in whole.feet]] = x.contact
+    return {
+        "fps": arrays["fps"].item(),
+        "dof_pos": arrays["joint_pos"],
+        "dof_vel": arrays["joint_vel"],
+        "rigid_body_pos": arrays["body_pos_w"],
+        "rigid_body_rot": np.roll(arrays["body_quat_w"], -1, axis=-1),
+        "rigid_body_vel": arrays["body_lin_vel_w"],
+        "rigid_body_ang_vel": arrays["body_ang_vel_w"],
+        "rigid_body_contacts": touching,
     }
 
 
@@ -339,7 +369,9 @@ CONTENTS: Mapping[str, Callable[[Whole, Motion, float], Any]] = {
     "gmr-pkl": retargeted,
     "mjlab-npz": tracked,
     "beyondmimic-npz": partial(tracked, order=ORDERS[1], at_com=True),
-    "holosoma-npz": with_world,
+    "holosoma-npz": with_root,
+    "unilab-npz": with_world,
+    "protomotions": states,
     "isaaclab-npz": with_base,
     "asap-pkl": partial(library_entry, without="wrist", more=3),  # head and hands
     "sonic-pkl": library_entry,

@@ -50,13 +50,8 @@ class Dynamics:
         motors = [robot.actuators.get(name, {}) for name in self.model.names[2:]]
         self.model.armature[6:] = [motor.get("armature", 0.0) for motor in motors]
         self._damping = np.array([motor.get("damping", 0.0) for motor in motors])
-        own = robot.model
-        frames = [own.frames[own.getFrameId(name, pin.BODY)] for name in robot.foot.frames]
         tip = pin.SE3(np.eye(3), robot.foot.tip)
-        self._tips = [
-            (self.model.getJointId(own.names[frame.parentJoint]), frame.placement * tip)
-            for frame in frames
-        ]
+        self._tips = [(self.model.getJointId(name), place * tip) for name, place in whole.feet]
 
     def held(self, q: np.ndarray, carries: np.ndarray) -> Held:
         """What the ground holds of the feet that ``carries`` (2,) names."""

@@ -63,6 +63,13 @@ class Whole:
             raise RobotError(f"robot {self.robot.name}: [published] lacks the link {link!r}")
         return self.model.getFrameId(link, pin.FrameType.BODY)
 
+    @property
+    def feet(self) -> list[tuple[str, pin.SE3]]:
+        """Of each foot the joint that moves it, and the place of its link in that joint's axes."""
+        own = self.robot.model
+        frames = [own.frames[own.getFrameId(name, pin.BODY)] for name in self.robot.foot.frames]
+        return [(own.names[frame.parentJoint], frame.placement) for frame in frames]
+
     def states(self, x: Motion) -> tuple[np.ndarray, np.ndarray]:
         """Configurations (F, nq) and velocities (F, nv) of :meth:`frames` in Pinocchio's order."""
         back = np.argsort(self.order)
