@@ -228,7 +228,8 @@ def test_files_and_their_names(tmp_path):
     assert odd.tolist() == [29.97] and export.tracked(WHOLE, frames(50.0), 50.0)["fps"].dtype == np.int64
     rates = {name: rate for name, (_, rate) in export.FORMATS.items()}
     assert rates == {"csv": 1000, "npz": 1000, "urdf-replay": 100, "unitree-csv": 30, "gmr-pkl": 30, "mjlab-npz": 50,
-                     "beyondmimic-npz": 50, "holosoma-npz": 50, "unilab-npz": 50, "protomotions": 30, "isaaclab-npz": 50, "asap-pkl": 30, "sonic-pkl": 50,
+                     "beyondmimic-npz": 50, "holosoma-npz": 50, "unilab-npz": 50, "protomotions": 30,
+                     "isaaclab-npz": 50, "asap-pkl": 30, "sonic-pkl": 50,
                      "bones-csv": 120, "mujoco": 1000}  # fmt: skip
 
 

@@ -95,9 +95,8 @@ def test_gains_count_for_the_errors_of_mujoco(tmp_path, monkeypatch):
         assert gain.shape == (4, model.nu, 2 * model.nv) and x["gain_time"][1] == gains.PERIOD_S
 
     error = 1e-5 * rng.normal(0, 1, 2 * NV)
-    beside = Motion(
-        t, np.array([pin.integrate(MODEL, row, error[:NV]) for row in q]), motion.v + error[NV:], none, motion.phase, "plan"
-    )
+    there = np.array([pin.integrate(MODEL, row, error[:NV]) for row in q])
+    beside = Motion(t, there, motion.v + error[NV:], none, motion.phase, "plan")
     there_qpos, there_qvel = export._qpos_qvel(WHOLE.frames(beside, 1000.0))
     dq = np.zeros(model.nv)
     mujoco.mj_differentiatePos(model, dq, 1.0, qpos, there_qpos[0])

@@ -72,7 +72,9 @@ class Dynamics:
         """Accelerations, and contact forces (with their sign turned), of right-hand sides."""
         mass = np.triu(self.data.M) + np.triu(self.data.M, 1).T
         rows = np.vstack([np.zeros((0, len(mass))), *jacobians])
-        return np.linalg.solve(np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]]), right)
+        return np.linalg.solve(
+            np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]]), right
+        )
 
     def accelerations(
         self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, held: Held
@@ -123,8 +125,8 @@ class Dynamics:
 
 
 def discrete(by_error: np.ndarray, by_torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices (2 nv, 2 nv) and (2 nv, nu) that lead errors over :data:`PERIOD_S`: velocities first,
-    then configurations with these.
+    """Matrices (2 nv, 2 nv) and (2 nv, nu) that lead errors over :data:`PERIOD_S`: velocities
+    first, then configurations with these.
     """
     nv = len(by_error)
     rates = np.eye(nv, 2 * nv, nv) + PERIOD_S * by_error
