@@ -4,15 +4,19 @@ import io
 import pickle
 import zipfile
 
+import mujoco
 import numpy as np
 import pytest
 from fixtures_core import jump
+from scipy.spatial.transform import Rotation
 
 from jumplab.errors import InputError
 from jumplab.io import export
 from jumplab.io.clip import read_clips
 from jumplab.io.motion import Motion
 from jumplab.io.tensors import read_tensors, tensor_file
+from jumplab.io.whole import Whole
+from jumplab.robot.stance import stance_configuration
 
 # of ProtoMotions' own filter of motions: heights [m], speeds [m/s, rad/s], and time in the air [s] above a height
 LOWEST_M, FASTEST_M_S, FASTEST_RAD_S, FLOAT_M, FLOAT_S = -0.05, 15.0, 40.0, 0.2, 1.0
@@ -32,7 +36,7 @@ def test_protomotions_takes_the_motion_and_its_filter_keeps_it(tmp_path):
     assert x["fps"] == 30 and x["dof_vel"].shape == (frames, joints)
     touching = x["rigid_body_contacts"]
     assert touching.dtype == bool and touching.shape == (frames, joints + 1)
-    feet = [list(export.Whole(plan().robot).links).index(name) for name in plan().robot.foot.frames]
+    feet = [list(Whole(plan().robot).links).index(name) for name in plan().robot.foot.frames]
     flying = Motion.of(plan().tape).every(30, end=True).phase == "flight"
     assert (touching[:, feet] == ~flying[:, None]).all() and touching.sum() == 2 * (~flying).sum()
     place = x["rigid_body_pos"]
@@ -112,3 +116,31 @@ def test_tensors_with_code_or_of_the_wrong_size_are_refused(bhr, tmp_path, monke
     path.write_bytes(torch_like(index, b"1234"))
     with pytest.raises(InputError, match=r"bad.motion: not a readable clip \(ValueError\)"):
         read_clips(path, bhr)
+
+
+# platforms
+# ----------------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("way", "top"), [([0.6, 0.0, 0.3], 0.3), ([0.0, 0.5, -0.2], -0.2), ([0.4, 0.0, 0.0], None)])
+def test_the_surface_on_which_a_motion_ends_goes_with_it(way, top, bhr, tmp_path):
+    q = np.tile(stance_configuration(bhr), (12, 1))
+    q[:, :3] += np.linspace(0, 1, 12)[:, None] * way
+    none = np.zeros((12, bhr.model.nv))
+    motion = Motion(np.arange(12) / 50, q, none, none[:, 6:], np.full(12, "launch"), "plan")
+    folder = export.write("mujoco", motion, bhr, tmp_path / "mujoco")
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    arrays = [np.load(export.write(f"{name}-npz", motion, bhr, tmp_path / f"{name}.npz")) for name in ("unilab", "holosoma")]
+    if top is None:
+        assert "platform" not in [model.geom(k).name for k in range(model.ngeom)]
+        assert not [name for x in arrays for name in x.files if name.startswith("object")]
+        return
+    box = model.geom("platform")
+    assert box.pos[2] + box.size[2] == pytest.approx(max(top, 0), abs=1e-6)
+    assert model.geom("ground").pos[2] == pytest.approx(min(top, 0), abs=1e-6)
+    turn = Rotation.from_quat(np.roll(box.quat, -1))
+    whole = Whole(bhr)
+    on = whole.soles(motion.q[-1 if top > 0 else 0]), whole.soles(motion.q[0 if top > 0 else -1])
+    own, other = (np.abs(turn.inv().apply(x.reshape(-1, 3) - box.pos))[:, :2] for x in on)
+    assert (own < box.size[:2] - 0.03).all() and (other > box.size[:2]).any(axis=1).all()
+    for x in arrays:
+        assert x["object_pos_w"][-1] == pytest.approx(box.pos, abs=1e-6) and x["object_quat_w"].shape == (12, 4)
+        assert not x["object_lin_vel_w"].any() and not x["object_ang_vel_w"].any()

@@ -172,12 +172,20 @@ def tracked(
 def with_world(
     whole: Whole, x: Motion, fps: float, *, at_com: bool = False
 ) -> dict[str, np.ndarray]:
-    """The arrays of :func:`tracked` with the world as first body."""
+    """The arrays of :func:`tracked` with the world as first body; where the motion ends higher or
+    lower than it begins also ``object_pos_w`` (F, 3), ``object_quat_w`` (F, 4) w x y z, and both
+    velocities (F, 3), of the box between (see :meth:`.Whole.block`).
+    """
     arrays = tracked(whole, x, fps, at_com=at_com)
     for name in ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w"):
         still = np.zeros_like(arrays[name][:, :1])
         still[..., 0] = name == "body_quat_w"
         arrays[name] = np.concatenate([still, arrays[name]], axis=1)
+    if block := whole.block(x):
+        turn = np.roll(Rotation.from_euler("z", block[2]).as_quat(), 1)
+        states = {"pos": block[1], "quat": turn, "lin_vel": np.zeros(3), "ang_vel": np.zeros(3)}
+        for name, state in states.items():
+            arrays[f"object_{name}_w"] = np.tile(state, (len(x.t), 1)).astype(np.float32)
     return arrays | {"body_names": np.array(["world", *whole.links])}
 
 
@@ -316,7 +324,7 @@ def _qpos_qvel(x: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
-    """The robot on level ground as MuJoCo's XML, with the motors that it is planned with;
+    """The robot on its ground as MuJoCo's XML, with the motors that it is planned with;
     ``qpos``, ``qvel``, ``ctrl`` (torques) and the arrays of :func:`.gains.gains`; and a script that
     plays them.
 
@@ -332,7 +340,14 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     spec.compiler.fusestatic = True
     spec.worldbody.first_body().add_freejoint()
     spec.option.gravity = [0.0, 0.0, -whole.robot.gravity]
-    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+    ground = spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE)
+    ground.size = [0.0, 0.0, 1.0]
+    if block := whole.block(x):
+        half, centre, heading = block
+        ground.pos = [0.0, 0.0, centre[2] - half[2]]
+        turn = np.roll(Rotation.from_euler("z", heading).as_quat(), 1)
+        box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": half, "pos": centre, "quat": turn}
+        spec.worldbody.add_geom(name="platform", **box)
     for name in whole.joints:
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         joint = spec.joint(name)

@@ -16,6 +16,11 @@ from jumplab.robot.files import entry, numbers, read_toml
 ORDERS = ("depth-first", "breadth-first")  # of links and joints: MuJoCo's and Isaac Lab's
 # [m] joints of both robots may be apart: twice what left and right are evened out by at most
 APART_M = 0.01
+# of the surface on which a motion ends: least height over where it begins; how far it reaches
+# before the soles at most, and beyond them
+RAISED_M = 0.02
+RIM_M = 0.05
+BEYOND_M = 1.0
 
 
 class Whole:
@@ -114,6 +119,34 @@ class Whole:
         tau[:, self._jumping] = x.tau
         states = (_sorted(rows, self.order) for rows in (q, v, tau))
         return Motion(x.t - x.t[0], *states, x.phase, x.source, x.wrench, x.contact)
+
+    def soles(self, q: np.ndarray) -> np.ndarray:
+        """Corners (2, 4, 3) of the soles [m] at a configuration (nq,) of :meth:`frames`."""
+        data = self.model.createData()
+        pin.forwardKinematics(self.model, data, _sorted(q[None], np.argsort(self.order))[0])
+        places = [data.oMi[self.model.getJointId(joint)] * place for joint, place in self.feet]
+        corners = self.robot.foot.corners
+        return np.array([corners @ place.rotation.T + place.translation for place in places])
+
+    def block(self, x: Motion) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """Half sizes (3,) and centre (3,) [m], and heading [rad], of a box on the lower of the two
+        surfaces on which a motion of :meth:`frames` begins and ends, as high as the other one;
+        None if they are level, or the motion does not end on flat soles.
+        """
+        ends = np.array([self.soles(x.q[k]).reshape(-1, 3) for k in (0, -1)])
+        way = (ends[1] - ends[0]).mean(axis=0)
+        if abs(way[2]) < RAISED_M or np.ptp(ends[1, :, 2]) > RAISED_M:
+            return None
+        heading = float(np.arctan2(way[1], way[0]))
+        axes = pin.rpy.rpyToMatrix(0.0, 0.0, heading)
+        along = (ends @ axes)[..., 0]
+        rim = min(RIM_M, max(along[1].min() - along[0].max(), 0.0) / 2)
+        edges = [along[1].min() - rim, along[1].max() + BEYOND_M]
+        if way[2] < 0:
+            edges = [along[0].min() - BEYOND_M, along[0].max() + rim]
+        middle = np.array([np.mean(edges), (ends @ axes)[..., 1].mean(), 0.0])
+        half = np.array([np.ptp(edges) / 2, BEYOND_M, abs(way[2]) / 2])
+        return half, axes @ middle + [0.0, 0.0, way[2] / 2], heading
 
     def own(self, q: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
         """The inverse of :meth:`frames`: configurations (F, nq) of the robot that jumps, from those
