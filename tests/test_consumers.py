@@ -128,7 +128,8 @@ def test_the_surface_on_which_a_motion_ends_goes_with_it(way, top, bhr, tmp_path
     motion = Motion(np.arange(12) / 50, q, none, none[:, 6:], np.full(12, "launch"), "plan")
     folder = export.write("mujoco", motion, bhr, tmp_path / "mujoco")
     model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
-    arrays = [np.load(export.write(f"{name}-npz", motion, bhr, tmp_path / f"{name}.npz")) for name in ("unilab", "holosoma")]
+    files = [export.write(name, motion, bhr, tmp_path / f"{name}.npz") for name in ("unilab-npz", "holosoma-npz")]
+    arrays = [np.load(file) for file in files]
     if top is None:
         assert "platform" not in [model.geom(k).name for k in range(model.ngeom)]
         assert not [name for x in arrays for name in x.files if name.startswith("object")]
