@@ -13,6 +13,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jumplab.cli.common import CHOICES
 from jumplab.errors import InputError
 from jumplab.io import export
 from jumplab.io.motion import Motion, read_simulation, steady
@@ -186,6 +187,7 @@ NAMES = {"csv": "joints.csv", "npz": "motion.npz", "urdf-replay": "replay", "uni
 def test_files_and_their_names(tmp_path):
     assert {k: export.default_name(k, "plan") for k in export.FORMATS} == NAMES
     assert {k: export.default_name(k, "simulation") for k in NAMES} == {k: f"simulated_{x}" for k, x in NAMES.items()}
+    assert CHOICES["formats"] == list(NAMES) == list(export.FORMATS)
     assert refused(lambda: export.write("bvh", short(), ROBOT, tmp_path / "x")) == (
         f"format 'bvh': must be one of {', '.join(NAMES)}"
     )
