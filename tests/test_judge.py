@@ -238,3 +238,13 @@ def test_the_command_judges_a_clip_and_a_folder(tmp_path, capsys):
     assert sentence.endswith(
         "none.pkl: not a readable clip (No such file or directory); give a pickle, npz or csv file"
     )
+
+
+def test_a_clip_at_the_wrong_rate_is_told_the_one_with_which_it_falls_freely(tmp_path, capsys):
+    path = tmp_path / "hop.csv"
+    plan = jump(0.6, 0.3, method="direct")
+    export.write("unitree-csv", Motion.of(plan.tape), plan.robot, path, fps=50)
+    code, out, _ = run(capsys, "judge", path, "--fps", "60")
+    assert code == 3 and "at 50 frames per second its flights would fall freely: is 60 its rate?" in out
+    code, out, _ = run(capsys, "judge", path, "--fps", "50")
+    assert code == 0 and "its rate?" not in out
