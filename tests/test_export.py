@@ -19,6 +19,7 @@ from jumplab.errors import InputError, RobotError
 from jumplab.io import export
 from jumplab.io import folder as store
 from jumplab.io.motion import Motion, steady
+from jumplab.io.tensors import read_tensors
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED
@@ -103,6 +104,12 @@ def states(format_name: str, path) -> dict:
         assert x.dtype.names[0] == "Frame" and (np.diff(x["Frame"]) == 1).all()
         return {"qpos": np.column_stack([place / 100, quaternions, angles]),
                 "joint_names": [n.removesuffix("_dof") for n in names]}  # fmt: skip
+    if format_name == "protomotions":
+        x = read_tensors(path.read_bytes())
+        first_w = np.roll(x["rigid_body_rot"], 1, axis=-1)
+        return {"qpos": np.column_stack([x["rigid_body_pos"][:, 0], first_w[:, 0], x["dof_pos"]]),
+                "body_pos_w": x["rigid_body_pos"], "body_quat_w": first_w, "body_lin_vel_w": x["rigid_body_vel"],
+                "body_ang_vel_w": x["rigid_body_ang_vel"], "rates": x["dof_vel"]}  # fmt: skip
     folder = {"mujoco": "motion.npz", "urdf-replay": "trajectory.npz"}.get(format_name)
     x = npz(path / folder if folder else path)
     if format_name in ("npz", "urdf-replay"):
@@ -173,7 +180,9 @@ def check_states(format_name, x, joints, qpos, qvel):
         columns = [joints.index(name) for name in x["order"]]
         assert np.abs(x["joint_pos"] - qpos[:, 7:][:, columns]).max() < 1e-5
         assert np.abs(x["joint_vel"] - qvel[:, 6:][:, columns]).max() < 1e-5
-    if format_name in ("mjlab-npz", "beyondmimic-npz"):
+    if format_name == "protomotions":
+        assert np.abs(x["rates"] - qvel[:, 6:]).max() < 1e-5
+    if format_name in ("mjlab-npz", "beyondmimic-npz", "unilab-npz"):
         columns = [joints.index(name) for name in x["joint_names"]]
         assert np.abs(x["joint_pos"] - qpos[:, 7:][:, columns]).max() < 1e-5
         assert np.abs(x["joint_vel"] - qvel[:, 6:][:, columns]).max() < 1e-5
@@ -186,10 +195,12 @@ def check_bodies(format_name, x, k, model, data, bodies):
         local = (data.xpos[1:] - data.xpos[1]) @ data.xmat[1].reshape(3, 3)
         assert np.abs(x["local_body_pos"][k] - local).max() < 1e-5
         return
-    names, first = list(x["body_names"]), int(format_name == "holosoma-npz")
+    first = int(format_name in ("holosoma-npz", "unilab-npz"))
+    names = list(x.get("body_names", bodies))
     assert names == ["world", *bodies][1 - first :] or format_name == "beyondmimic-npz"
     assert sorted(names[first:]) == sorted(bodies)
-    of = mujoco.mjtObj.mjOBJ_XBODY if format_name == "mjlab-npz" else mujoco.mjtObj.mjOBJ_BODY  # origin, or CoM
+    at_com = format_name in ("beyondmimic-npz", "holosoma-npz")
+    of = mujoco.mjtObj.mjOBJ_BODY if at_com else mujoco.mjtObj.mjOBJ_XBODY  # centre of mass, or origin
     for i, name in enumerate(names):
         body = model.body(name).id
         mujoco.mj_objectVelocity(model, data, of, body, twist, 0)
@@ -215,9 +226,8 @@ def test_the_folder_for_mujoco(name, tmp_path):
     effort = [Robot.load(name).actuators.get(joint, {}).get("effort") for joint in x["joint_names"]]
     for limits, most in zip(model.actuator_ctrlrange, effort, strict=True):
         assert (limits == [-most, most]).all() if most else limits[1] > 0  # as it was planned with
-    assert (
-        model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and (model.geom_solref[:, 0] == export.MUJOCO_CONTACT_S).all()
-    )
+    assert model.opt.timestep == mujoco.MjOption().timestep == 0.002  # what users have, contacts too
+    assert model.opt.cone == mujoco.MjOption().cone and (model.geom_solref == [0.02, 1.0]).all()
     for mine, other in ((model.body_mass, there.body_mass), (model.body_inertia, there.body_inertia),
                         (model.body_ipos, there.body_ipos), (model.body_pos, there.body_pos)):  # fmt: skip
         assert np.abs(mine - other)[1:].max() < 1e-6

@@ -13,6 +13,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jumplab.cli.common import CHOICES
 from jumplab.errors import InputError
 from jumplab.io import export
 from jumplab.io.motion import Motion, read_simulation, steady
@@ -123,7 +124,7 @@ def test_names_and_kinds_of_what_trackers_read():
 
 def test_the_world_is_the_first_body():
     x = frames(500.0)
-    clip, bare = export.with_world(WHOLE, x, 500.0), export.tracked(WHOLE, x, 500.0, at_com=True)
+    clip, bare = export.with_root(WHOLE, x, 500.0), export.tracked(WHOLE, x, 500.0, at_com=True)
     assert list(clip) == KEYS and list(clip["body_names"]) == ["world", *WHOLE.links]
     assert not clip["body_pos_w"][:, 0].any() and not clip["body_lin_vel_w"][:, 0].any()
     assert (clip["body_quat_w"][:, 0] == [1, 0, 0, 0]).all() and not clip["body_ang_vel_w"][:, 0].any()
@@ -178,13 +179,15 @@ def test_links_in_both_orders():
 # files ----------------------------------------------------------------------------------------------------------
 NAMES = {"csv": "joints.csv", "npz": "motion.npz", "urdf-replay": "replay", "unitree-csv": "unitree.csv",
          "gmr-pkl": "gmr.pkl", "mjlab-npz": "mjlab.npz", "beyondmimic-npz": "beyondmimic.npz",
-         "holosoma-npz": "holosoma.npz", "isaaclab-npz": "isaaclab.npz", "asap-pkl": "asap.pkl",
+         "holosoma-npz": "holosoma.npz", "unilab-npz": "unilab.npz",
+         "protomotions": "protomotions.motion", "isaaclab-npz": "isaaclab.npz", "asap-pkl": "asap.pkl",
          "sonic-pkl": "sonic.pkl", "bones-csv": "bones.csv", "mujoco": "mujoco"}  # fmt: skip
 
 
 def test_files_and_their_names(tmp_path):
     assert {k: export.default_name(k, "plan") for k in export.FORMATS} == NAMES
     assert {k: export.default_name(k, "simulation") for k in NAMES} == {k: f"simulated_{x}" for k, x in NAMES.items()}
+    assert CHOICES["formats"] == list(NAMES) == list(export.FORMATS)
     assert refused(lambda: export.write("bvh", short(), ROBOT, tmp_path / "x")) == (
         f"format 'bvh': must be one of {', '.join(NAMES)}"
     )
@@ -199,7 +202,8 @@ def test_files_and_their_names(tmp_path):
         ("mjlab-npz", export.tracked(WHOLE, frames(50.0), 50.0), None),
         ("mjlab-npz", export.tracked(WHOLE, frames(250.0), 250.0), 250),
         ("beyondmimic-npz", export.tracked(WHOLE, frames(50.0), 50.0, order=ORDERS[1], at_com=True), None),
-        ("holosoma-npz", export.with_world(WHOLE, frames(50), 50), None),
+        ("holosoma-npz", export.with_root(WHOLE, frames(50), 50), None),
+        ("unilab-npz", export.with_world(WHOLE, frames(50), 50), None),
     ):
         path = export.write(name, short(), ROBOT, tmp_path / "x.npz", fps=fps)
         raw = sum(x.nbytes for x in arrays.values())
@@ -226,7 +230,8 @@ def test_files_and_their_names(tmp_path):
     assert odd.tolist() == [29.97] and export.tracked(WHOLE, frames(50.0), 50.0)["fps"].dtype == np.int64
     rates = {name: rate for name, (_, rate) in export.FORMATS.items()}
     assert rates == {"csv": 1000, "npz": 1000, "urdf-replay": 100, "unitree-csv": 30, "gmr-pkl": 30, "mjlab-npz": 50,
-                     "beyondmimic-npz": 50, "holosoma-npz": 50, "isaaclab-npz": 50, "asap-pkl": 30, "sonic-pkl": 50,
+                     "beyondmimic-npz": 50, "holosoma-npz": 50, "unilab-npz": 50, "protomotions": 30,
+                     "isaaclab-npz": 50, "asap-pkl": 30, "sonic-pkl": 50,
                      "bones-csv": 120, "mujoco": 1000}  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from jumplab.robot_import.urdf import have_published
 
 CLIPS = Path(__file__).parent / "clips"
 FILES = [name for name in export.FORMATS if Path(export.FORMATS[name][0]).suffix]
+assert len(FILES) == len(export.FORMATS) - 2  # all but the two folders
 NO_ROBOTS = pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 
 
@@ -170,6 +171,12 @@ WRONG = {
     "lengths": (dict(dof=Q[:5, 7:]), r"must be \(n, 3\), \(n, 4\), \(n, joints\)"),
     "order": (dict(dof=2.9 + 0 * Q[:, 7:]), "most of the time: another order of joints, or another robot's clip"),
     "length": (dict(root_rot=2 * Q[:, 3:7]), "the quaternion of frame 0 has length 2, not 1"),
+    "a list": (dict(dof=[None] * len(Q)), r"its arrays do not fit each other \(joints: no real numbers\)"),
+    "complex": (dict(dof=Q[:, 7:] + 0j), r"its arrays do not fit each other \(joints: no real numbers\)"),
+    "slow": (dict(fps=3), "says 3 frames per second; a motion has 5 to 10000: correct it in the file"),
+    "no rate": (dict(fps=0), "says 0 frames per second"),
+    "nan rate": (dict(fps=float("nan")), "says nan frames per second"),
+    "back in time": (dict(fps=-30), "says -30 frames per second"),
     "metres": (dict(root_trans_offset=100 * Q[:, :3]), "looks like centimetres: pass metres"),
 }
 
@@ -231,3 +238,13 @@ def test_the_command_judges_a_clip_and_a_folder(tmp_path, capsys):
     assert sentence.endswith(
         "none.pkl: not a readable clip (No such file or directory); give a pickle, npz or csv file"
     )
+
+
+def test_a_clip_at_the_wrong_rate_is_told_the_one_with_which_it_falls_freely(tmp_path, capsys):
+    path = tmp_path / "hop.csv"
+    plan = jump(0.6, 0.3, method="direct")
+    export.write("unitree-csv", Motion.of(plan.tape), plan.robot, path, fps=50)
+    code, out, _ = run(capsys, "judge", path, "--fps", "60")
+    assert code == 3 and "at 50 frames per second its flights would fall freely: is 60 its rate?" in out
+    code, out, _ = run(capsys, "judge", path, "--fps", "50")
+    assert code == 0 and "its rate?" not in out

@@ -14,6 +14,8 @@ from jumplab.errors import InfeasibleError
 
 REPORT = "judged.json"
 CHANGES = "mended.json"
+RATES = (24, 25, 30, 50, 60, 100, 120, 200, 240)  # usual frames per second
+NEAR = 0.03  # relative, of two rates that are the same
 
 
 def judge(args: Namespace) -> None:
@@ -39,8 +41,24 @@ def judge(args: Namespace) -> None:
     print(report.clip.line())
     print("contacts: " + ", ".join(f"{feet} {a:.2f} to {b:.2f} s" for feet, a, b in report.phases))
     print(report.table())
+    if rate := _better_rate(report):
+        words = f"at {rate} frames per second its flights would fall freely: is {report.clip.fps:g}"
+        print(f"{words} its rate?")
     if not report.passed:
         raise InfeasibleError(f"clip {report.line()}")
+
+
+def _better_rate(report: Any) -> int | None:
+    """The usual frame rate at which all flights of a clip fall freely, if not at its own."""
+    falls = [-flight["acceleration_m_s2"][2] for flight in report.manifest["flights"]]
+    if not falls or min(falls) <= 0:
+        return None
+    wanted = [report.clip.fps * (report.clip.robot.gravity / fall) ** 0.5 for fall in falls]
+    for rate in RATES:
+        there = all(abs(x / rate - 1) < NEAR for x in wanted)
+        if there and abs(rate / report.clip.fps - 1) > 2 * NEAR:
+            return rate
+    return None
 
 
 def _write(folder: str, reports: list[Any], found: dict[str, Any]) -> None:

@@ -17,14 +17,16 @@ from jumplab import reading
 from jumplab.errors import InputError, Shown, as_path, quoted
 from jumplab.io.columns import BASE
 from jumplab.io.motion import Motion, steady
+from jumplab.io.tensors import read_tensors
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED, read_toml
 
-ENDINGS = (".pkl", ".npz", ".csv")
+ENDINGS = (".pkl", ".npz", ".csv", ".motion")
 USUAL_FPS = 30.0  # of files that do not say
 RECORD_FPS = 100.0  # at which plans and simulations are looked at
 LEAST_FRAMES = 10
+FPS = 5.0, 10_000.0  # least and most
 TURN_RAD = 7.0  # no joint turns further
 BEYOND_RAD = 0.5  # of its range, by which a joint of the right robot is not most of the time
 STILL_RAD = 0.02  # by which a joint that the robot holds may move
@@ -122,7 +124,8 @@ def _content(path: Path) -> Mapping[str, Any]:
     try:
         raw = reading.content(path, "clip")
         if raw[:2] == b"PK":
-            return reading.arrays(raw)
+            found = read_tensors(raw)
+            return reading.arrays(raw) if found is None else found
         if raw[:1] == b"\x80":
             return _Arrays(str(path), io.BytesIO(raw), ensure_native_byte_order=True).load()
         return _columns(raw.decode())
@@ -168,10 +171,16 @@ def _first_wxyz(x: np.ndarray) -> np.ndarray:
 
 def _of_tracker(x: Mapping[str, Any]) -> _Raw:
     joints = x["joint_pos"]
-    world = "body_names" in x and str(x["body_names"][0]) == "world"
+    world = not x["body_pos_w"][:, 0].any()
     place, turn = (x[name][:, int(world)] for name in ("body_pos_w", "body_quat_w"))
     words = "arrays of a motion tracker, quaternion w x y z"
-    return _Raw(place, _first_wxyz(turn), joints[:, 7 * world :], words)
+    root = joints.shape[1] - len(x["joint_names"]) if "joint_names" in x else 0
+    return _Raw(place, _first_wxyz(turn), joints[:, root:], words)
+
+
+def _of_states(x: Mapping[str, Any]) -> _Raw:
+    place, turn = (x[f"rigid_body_{name}"][:, 0] for name in ("pos", "rot"))
+    return _Raw(place, turn, x["dof_pos"], "states of all bodies, quaternion x y z w")
 
 
 def _of_table(x: Mapping[str, Any]) -> _Raw:
@@ -215,6 +224,7 @@ FORMS: Mapping[tuple[str, ...], Callable[[Mapping[str, Any]], _Raw] | str] = {
         "joint_position_rad",
     ): "arrays with units, quaternion x y z w",
     ("body_pos_w", "body_quat_w", "joint_pos"): _of_tracker,
+    ("rigid_body_pos", "rigid_body_rot", "dof_pos"): _of_states,
     ("base_pos_w", "base_quat_w", "joint_pos"): "base and joints, quaternion w x y z",
     ("root_translateX", "root_rotateX"): _of_animation,
     ("qpos",): "MuJoCo's qpos, quaternion w x y z",
@@ -259,8 +269,8 @@ def read_clips(
     path = as_path(path, "a clip's file")
     if order not in ORDERS:
         raise InputError(f"order = {quoted(order)}: choose one of {', '.join(ORDERS)}")
-    if fps is not None and not 0 < fps <= 1e4:
-        raise InputError(f"fps = {fps:g} must lie above 0 and not above 10000")
+    if fps is not None and not FPS[0] <= fps <= FPS[1]:
+        raise InputError(f"fps = {fps:g} must lie between {FPS[0]:g} and {FPS[1]:g}")
     content = _content(path)
     found = []
     for name, x, form in _entries(content, path.stem):
@@ -269,7 +279,7 @@ def read_clips(
             reader = FORMS[form]
             raw = _of_arrays(reader, x, form) if isinstance(reader, str) else reader(x)
             names = raw.names or tuple(map(str, x.get("joint_names", ()))) or None
-            raw = replace(raw, fps=_rate(x), names=names)
+            raw = replace(raw, fps=_rate(x), names=names, **_numbers(raw))
         except (KeyError, IndexError, TypeError, ValueError) as e:
             raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
         found.append(_clip(where, name, raw, robot, fps, order))
@@ -285,7 +295,12 @@ def read_clips(
 def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, order: str) -> Clip:
     """A clip of what a file holds, or a sentence."""
     notes = []
-    rate = raw.fps or fps or raw.usual_fps
+    rate = raw.fps if raw.fps is not None else fps or raw.usual_fps
+    if not FPS[0] <= rate <= FPS[1]:
+        raise InputError(
+            f"{where}: says {rate:g} frames per second; a motion has {FPS[0]:g} to {FPS[1]:g}: "
+            f"correct it in the file"
+        )
     if raw.fps is None:
         notes.append(f"{rate:g} frames per second {'as given' if fps else 'assumed'}")
     elif fps is not None and abs(fps - raw.fps) > 0.01 * raw.fps:
@@ -301,6 +316,15 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
     q = np.hstack([q[:, :3], steady(q[:, 3:7]), q[:, 7:]])
     _check_joints(where, robot, q, raw.names is None, order)
     return Clip(name, robot, q, rate, raw.origin, tuple(notes))
+
+
+def _numbers(raw: _Raw) -> dict[str, np.ndarray]:
+    """Base, quaternions and joints as arrays; raises ValueError if they are none."""
+    out = {name: np.asarray(getattr(raw, name)) for name in ("base", "turn", "joints")}
+    for name, array in out.items():
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"{name}: no real numbers")
+    return out
 
 
 def _check_numbers(where: str, raw: _Raw) -> None:

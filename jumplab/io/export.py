@@ -16,17 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.io import gains
 from jumplab.io.columns import table_of
 from jumplab.io.folder import FORMATS, transaction, write_file
 from jumplab.io.motion import Motion, checked_rate
+from jumplab.io.tensors import tensor_file
 from jumplab.io.whole import ORDERS, Whole, axes_of, ordered
 from jumplab.robot import Robot
 
-# of MuJoCo's folder: the step, the time in which a penetration fades, impedance of friction over
-# that of pressure
-MUJOCO_STEP_S = 0.001
-MUJOCO_CONTACT_S = 0.005
-MUJOCO_CONE_RATIO = 10.0
 HELD_RAD = 0.02  # by which joints that a format leaves out may move
 LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
 PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
@@ -86,6 +83,8 @@ def _encoded(ending: str, content: Any) -> bytes:
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **content)
         return buffer.getvalue()
+    if ending == ".motion":
+        return tensor_file(content)
     return pickle.dumps(content, protocol=4) if ending == ".pkl" else content.encode()
 
 
@@ -170,18 +169,34 @@ def tracked(
     }
 
 
-def with_world(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
-    """The arrays of :func:`tracked`, velocities at centres of mass, with the world as first body
-    and the root's state before the joints', as MuJoCo's (see :func:`_qpos_qvel`).
+def with_world(
+    whole: Whole, x: Motion, fps: float, *, at_com: bool = False
+) -> dict[str, np.ndarray]:
+    """The arrays of :func:`tracked` with the world as first body; where the motion ends higher or
+    lower than it begins also ``object_pos_w`` (F, 3), ``object_quat_w`` (F, 4) w x y z, and both
+    velocities (F, 3), of the box between (see :meth:`.Whole.block`).
     """
-    arrays = tracked(whole, x, fps, at_com=True)
+    arrays = tracked(whole, x, fps, at_com=at_com)
     for name in ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w"):
         still = np.zeros_like(arrays[name][:, :1])
         still[..., 0] = name == "body_quat_w"
         arrays[name] = np.concatenate([still, arrays[name]], axis=1)
+    if block := whole.block(x):
+        turn = np.roll(Rotation.from_euler("z", block[2]).as_quat(), 1)
+        states = {"pos": block[1], "quat": turn, "lin_vel": np.zeros(3), "ang_vel": np.zeros(3)}
+        for name, state in states.items():
+            arrays[f"object_{name}_w"] = np.tile(state, (len(x.t), 1)).astype(np.float32)
+    return arrays | {"body_names": np.array(["world", *whole.links])}
+
+
+def with_root(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
+    """The arrays of :func:`with_world`, velocities at centres of mass, with the root's state before
+    the joints', as MuJoCo's (see :func:`_qpos_qvel`).
+    """
+    arrays = with_world(whole, x, fps, at_com=True)
     for name, state in zip(("joint_pos", "joint_vel"), _qpos_qvel(x), strict=True):
         arrays[name] = state.astype(np.float32)
-    return arrays | {"body_names": np.array(["world", *whole.links])}
+    return arrays
 
 
 def retargeted(whole: Whole, x: Motion, fps: float) -> dict[str, object]:
@@ -199,6 +214,25 @@ def retargeted(whole: Whole, x: Motion, fps: float) -> dict[str, object]:
         "contact": x.contact,
         "phase": [str(name) for name in x.phase],
         "joint_names": list(whole.joints),
+    }
+
+
+def states(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
+    """What ProtoMotions reads: joints depth-first; of all links places, rotations x y z w,
+    velocities of their origins and whether they touch the ground, as the feet do; 32-bit floats.
+    """
+    arrays = tracked(whole, x, fps)
+    touching = np.zeros(arrays["body_pos_w"].shape[:2], bool)
+    touching[:, [1 + whole.joints.index(joint) for joint, _ in whole.feet]] = x.contact
+    return {
+        "fps": arrays["fps"].item(),
+        "dof_pos": arrays["joint_pos"],
+        "dof_vel": arrays["joint_vel"],
+        "rigid_body_pos": arrays["body_pos_w"],
+        "rigid_body_rot": np.roll(arrays["body_quat_w"], -1, axis=-1),
+        "rigid_body_vel": arrays["body_lin_vel_w"],
+        "rigid_body_ang_vel": arrays["body_ang_vel_w"],
+        "rigid_body_contacts": touching,
     }
 
 
@@ -290,11 +324,12 @@ def _qpos_qvel(x: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
-    """The robot on level ground as MuJoCo's XML, with the motors that it is planned with, and
-    ``qpos``, ``qvel``, ``ctrl`` (torques).
+    """The robot on its ground as MuJoCo's XML, with the motors that it is planned with;
+    ``qpos``, ``qvel``, ``ctrl`` (torques) and the arrays of :func:`.gains.gains`; and a script that
+    plays them.
 
-    Limits of torque are the plan's, as are armature, friction and damping of the joints. Steps are
-    short and contacts hard, or feet that land sink and slide.
+    Limits of torque are the plan's, as are armature, friction and damping of the joints. Step and
+    contacts are MuJoCo's own.
     """
     import mujoco
 
@@ -304,15 +339,15 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     spec.compiler.discardvisual = False
     spec.compiler.fusestatic = True
     spec.worldbody.first_body().add_freejoint()
-    option = spec.option
-    option.gravity = [0.0, 0.0, -whole.robot.gravity]
-    option.timestep = MUJOCO_STEP_S
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = MUJOCO_CONE_RATIO
-    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
-    for geom in spec.geoms:
-        geom.solref = [MUJOCO_CONTACT_S, 1.0]
+    spec.option.gravity = [0.0, 0.0, -whole.robot.gravity]
+    ground = spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE)
+    ground.size = [0.0, 0.0, 1.0]
+    if block := whole.block(x):
+        half, centre, heading = block
+        ground.pos = [0.0, 0.0, centre[2] - half[2]]
+        turn = np.roll(Rotation.from_euler("z", heading).as_quat(), 1)
+        box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": half, "pos": centre, "quat": turn}
+        spec.worldbody.add_geom(name="platform", **box)
     for name in whole.joints:
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         joint = spec.joint(name)
@@ -324,17 +359,21 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
         motor.ctrlrange = joint.actfrcrange
     spec.compile()
     qpos, qvel = _qpos_qvel(x)
+    gain_time, gain = gains.gains(whole, x)
     arrays = {
         "time": x.t,
         "qpos": qpos,
         "qvel": qvel,
         "ctrl": x.tau,
+        "gain_time": gain_time,
+        "gain": gain,
         "joint_names": np.array(whole.joints),
         "contact": x.contact,
         "phase": x.phase,
         "fps": np.array(fps),
     }
-    return {"robot.xml": spec.to_xml(), "motion.npz": arrays}
+    script = (resources.files("jumplab.io") / "play.py.txt").read_text(encoding="utf-8")
+    return {"robot.xml": spec.to_xml(), "motion.npz": arrays, "play.py": script}
 
 
 CONTENTS: Mapping[str, Callable[[Whole, Motion, float], Any]] = {
@@ -345,7 +384,9 @@ CONTENTS: Mapping[str, Callable[[Whole, Motion, float], Any]] = {
     "gmr-pkl": retargeted,
     "mjlab-npz": tracked,
     "beyondmimic-npz": partial(tracked, order=ORDERS[1], at_com=True),
-    "holosoma-npz": with_world,
+    "holosoma-npz": with_root,
+    "unilab-npz": with_world,
+    "protomotions": states,
     "isaaclab-npz": with_base,
     "asap-pkl": partial(library_entry, without="wrist", more=3),  # head and hands
     "sonic-pkl": library_entry,

@@ -60,6 +60,8 @@ FORMATS = {
     "mjlab-npz": ("mjlab.npz", 50.0),
     "beyondmimic-npz": ("beyondmimic.npz", 50.0),
     "holosoma-npz": ("holosoma.npz", 50.0),
+    "unilab-npz": ("unilab.npz", 50.0),
+    "protomotions": ("protomotions.motion", 30.0),
     "isaaclab-npz": ("isaaclab.npz", 50.0),
     "asap-pkl": ("asap.pkl", 30.0),
     "sonic-pkl": ("sonic.pkl", 50.0),

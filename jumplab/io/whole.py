@@ -16,6 +16,11 @@ from jumplab.robot.files import entry, numbers, read_toml
 ORDERS = ("depth-first", "breadth-first")  # of links and joints: MuJoCo's and Isaac Lab's
 # [m] joints of both robots may be apart: twice what left and right are evened out by at most
 APART_M = 0.01
+# of the surface on which a motion ends: least height over where it begins; how far it reaches
+# before the soles at most, and beyond them
+RAISED_M = 0.02
+RIM_M = 0.05
+BEYOND_M = 1.0
 
 
 class Whole:
@@ -50,7 +55,7 @@ class Whole:
         for name in (*robot.joint_names, *self._held):
             if name not in self.joints:
                 raise RobotError(f"robot {robot.name}: [published] lacks the joint {name!r}")
-        self._order = self._columns(self.joints)
+        self.order = self._columns(self.joints)
         self._jumping = self._columns(robot.joint_names)
 
     def _columns(self, names: Iterable[str]) -> np.ndarray:
@@ -63,15 +68,22 @@ class Whole:
             raise RobotError(f"robot {self.robot.name}: [published] lacks the link {link!r}")
         return self.model.getFrameId(link, pin.FrameType.BODY)
 
+    @property
+    def feet(self) -> list[tuple[str, pin.SE3]]:
+        """Of each foot the joint that moves it, and the place of its link in that joint's axes."""
+        own = self.robot.model
+        frames = [own.frames[own.getFrameId(name, pin.BODY)] for name in self.robot.foot.frames]
+        return [(own.names[frame.parentJoint], frame.placement) for frame in frames]
+
     def states(self, x: Motion) -> tuple[np.ndarray, np.ndarray]:
         """Configurations (F, nq) and velocities (F, nv) of :meth:`frames` in Pinocchio's order."""
-        back = np.argsort(self._order)
+        back = np.argsort(self.order)
         return _sorted(x.q, back), _sorted(x.v, back)
 
     def com(self, q: np.ndarray) -> np.ndarray:
         """CoM (F, 3) [m] at configurations (F, nq) of :meth:`frames`."""
         data = self.model.createData()
-        rows = _sorted(q, np.argsort(self._order))
+        rows = _sorted(q, np.argsort(self.order))
         return np.array([pin.centerOfMass(self.model, data, row).copy() for row in rows])
 
     def frames(self, motion: Motion, fps: float) -> Motion:
@@ -105,8 +117,36 @@ class Whole:
         change = np.gradient(v, x.t, axis=0) if len(x.t) > 1 else np.zeros_like(v)
         tau = np.array([pin.rnea(model, data, *row)[6:] for row in zip(q, v, change, strict=True)])
         tau[:, self._jumping] = x.tau
-        states = (_sorted(rows, self._order) for rows in (q, v, tau))
+        states = (_sorted(rows, self.order) for rows in (q, v, tau))
         return Motion(x.t - x.t[0], *states, x.phase, x.source, x.wrench, x.contact)
+
+    def soles(self, q: np.ndarray) -> np.ndarray:
+        """Corners (2, 4, 3) of the soles [m] at a configuration (nq,) of :meth:`frames`."""
+        data = self.model.createData()
+        pin.forwardKinematics(self.model, data, _sorted(q[None], np.argsort(self.order))[0])
+        places = [data.oMi[self.model.getJointId(joint)] * place for joint, place in self.feet]
+        corners = self.robot.foot.corners
+        return np.array([corners @ place.rotation.T + place.translation for place in places])
+
+    def block(self, x: Motion) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """Half sizes (3,) and centre (3,) [m], and heading [rad], of a box on the lower of the two
+        surfaces on which a motion of :meth:`frames` begins and ends, as high as the other one;
+        None if they are level, or the motion does not end on flat soles.
+        """
+        ends = np.array([self.soles(x.q[k]).reshape(-1, 3) for k in (0, -1)])
+        way = (ends[1] - ends[0]).mean(axis=0)
+        if abs(way[2]) < RAISED_M or np.ptp(ends[1, :, 2]) > RAISED_M:
+            return None
+        heading = float(np.arctan2(way[1], way[0]))
+        axes = pin.rpy.rpyToMatrix(0.0, 0.0, heading)
+        along = (ends @ axes)[..., 0]
+        rim = min(RIM_M, max(along[1].min() - along[0].max(), 0.0) / 2)
+        edges = [along[1].min() - rim, along[1].max() + BEYOND_M]
+        if way[2] < 0:
+            edges = [along[0].min() - BEYOND_M, along[0].max() + rim]
+        middle = np.array([np.mean(edges), (ends @ axes)[..., 1].mean(), 0.0])
+        half = np.array([np.ptp(edges) / 2, BEYOND_M, abs(way[2]) / 2])
+        return half, axes @ middle + [0.0, 0.0, way[2] / 2], heading
 
     def own(self, q: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
         """The inverse of :meth:`frames`: configurations (F, nq) of the robot that jumps, from those
@@ -114,7 +154,7 @@ class Whole:
         off where they are held [rad].
         """
         data = self.model.createData()
-        state = _sorted(q, np.argsort(self._order))
+        state = _sorted(q, np.argsort(self.order))
         places = []
         for row in state:
             pin.forwardKinematics(self.model, data, row)
