@@ -1,6 +1,4 @@
-"""What ``jumplab robot check`` finds out about a URDF, as one result; above all, whether five links
-describe it.
-"""
+"""Result of ``jumplab robot check`` on a URDF; above all, whether five links describe it."""
 
 from __future__ import annotations
 
@@ -48,7 +46,7 @@ class Checkup:
         return out
 
     def lines(self) -> list[str]:
-        """What else is worth knowing, a line each."""
+        """Further facts about the robot, a line each."""
         r = self.robot
         moving = len(r.joint_names)
         foot = r.foot

@@ -239,7 +239,7 @@ def _limits(
 
 
 def _motor_fault(limits: dict[str, float]) -> str:
-    """What is wrong with the numbers of a motor, in a sentence; empty if nothing is."""
+    """Fault of a motor's numbers, in a sentence; empty if they have none."""
     speed = limits["velocity"]
     effort = limits["effort"]
     free = limits.get(NO_LOAD, speed)

@@ -231,7 +231,9 @@ def tensor_of(link: ET.Element) -> np.ndarray:
 
 
 def unsolid(matrix: np.ndarray) -> float:
-    """How far an inertia (3, 3) is from the nearest of a solid [kg m^2]; 0 for those."""
+    """Largest entry by which an inertia (3, 3) differs from its nearest physical one [kg m^2]; 0 if
+    it is physical.
+    """
     low, middle, high = np.linalg.eigvalsh(matrix)
     solid = low > 0 and high <= (low + middle) * (1 + TRIANGLE)
     return 0.0 if solid else max(float(np.abs(repaired(matrix) - matrix).max()), 1e-15)
