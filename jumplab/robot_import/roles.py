@@ -1,4 +1,5 @@
-"""Guesses from a URDF that nobody has described yet: roles, soles, and a first TOML file to check.
+"""Roles, soles and a first TOML file to look through, found in a URDF that nobody has described
+yet.
 
 Which joint is which is found from how it moves its links, never from its name.
 """
