@@ -1,5 +1,5 @@
-"""What the ground can do to a foot, and how a foot's points move: numbers that hold for NumPy and
-for CasADi alike.
+"""Limits of contact forces at a foot, and motion of points of a foot: numbers that hold for NumPy
+and for CasADi alike.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def on_feet(robot: Robot, point: np.ndarray) -> list[Anchor]:
 
 @dataclass(frozen=True, eq=False)
 class PointMotion:
-    """How a point of a link moves, in world axes.
+    """Motion of a point of a link, in world axes.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ def moving(model: pin.Model, data: pin.Data, q: np.ndarray, v: np.ndarray) -> No
 
 
 def point_motion(model: pin.Model, data: pin.Data, anchor: Anchor) -> PointMotion:
-    """How an anchor moves [m, rad, s] in the state that ``data`` is :func:`moving` in."""
+    """Motion of an anchor [m, rad, s] in the state that ``data`` is :func:`moving` in."""
     at = anchor.joint, anchor.placement
     place = data.oMi[anchor.joint] * anchor.placement
     jacobian = pin.getFrameJacobian(model, data, *at, WORLD)
