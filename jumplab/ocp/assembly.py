@@ -183,7 +183,7 @@ def gather(entries: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
 
 @dataclass(frozen=True)
 class Block:
-    """What one part contributes to the NLP: its functions, called at all of its nodes."""
+    """Contribution of one part to the NLP: its functions, called at all of its nodes."""
 
     part: Part
     functions: dict[str, ca.Function]

@@ -61,7 +61,9 @@ class Block:
         return np.maximum(1.0, np.maximum(np.abs(self.matrix).max(axis=1, initial=0.0), side))
 
     def violation(self, x: np.ndarray) -> np.ndarray:
-        """How far ``x`` (n,) is outside of each row (m,), in the row's own unit."""
+        """Distance of ``x`` (n,) from the bounds of each row (m,), in the row's own unit; 0 within
+        them.
+        """
         value = self.matrix @ x
         return np.maximum(np.maximum(self.low - value, value - self.high), 0.0)
 
@@ -153,8 +155,8 @@ def _column(x: Any, size: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class QpAnswer:
-    """Where a solve ended: ``x`` (n,), iterations, the solver's own word, and whether it says that
-    this is the optimum.
+    """Result of a solve: ``x`` (n,), iterations, the solver's own word, and whether by that word
+    ``x`` is the optimum.
     """
 
     x: np.ndarray
