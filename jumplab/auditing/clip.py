@@ -64,7 +64,7 @@ class ClipReport(AuditReport):
         return [(a, b) for feet, a, b in self.phases if feet == "-"]
 
     def row(self) -> dict[str, Any]:
-        """What a table of many clips says of this one."""
+        """Row of this clip in a table of many."""
         flown = ", ".join(f"{a:.2f} to {b:.2f}" for a, b in self.flights)
         row = {"clip": self.clip.name, "physical": self.passed, "flights [s]": flown or "none"}
         return row | {f"{c.name} [{c.unit}]": c.value for c in self.checks}

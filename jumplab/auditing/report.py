@@ -1,4 +1,4 @@
-"""What an audit looks at and says: limits (``limits.toml``), checks, and the report of them."""
+"""Limits (``limits.toml``) and checks of an audit, and the report of them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,9 @@ class Check:
 
 @dataclass(frozen=True)
 class Limit:
-    """What a check allows: ``limit`` in ``unit``; ``note`` says what is measured, with braces."""
+    """Limit of a check: ``limit`` in ``unit``; ``note`` is the text on the measurement, with
+    braces.
+    """
 
     group: str
     name: str
@@ -121,7 +123,9 @@ class AuditReport(Shown):
     capture: Check | None = None
 
     def line(self) -> str:
-        """How many checks passed, and which did not; and whether it lands too fast to be caught."""
+        """Number of checks that passed, names of those that failed, and whether the jump lands too
+        fast to be caught.
+        """
         words = f"all {len(self.checks)} checks passed"
         if not self.passed:
             names = ", ".join(c.name for c in self.failed)
@@ -135,7 +139,7 @@ class AuditReport(Shown):
 
     @property
     def uncaught(self) -> str:
-        """Why a landing can hardly be caught; empty if nothing speaks against it."""
+        """Reason why a landing can hardly be caught; empty if there is none."""
         c = self.capture
         if c is None or c.passed:
             return ""
