@@ -1,4 +1,4 @@
-"""What the commands share: how their options are read, and what is printed of a result.
+"""Code that commands share: it reads their options, and prints results.
 
 Help and refusals do not wait for the heavy libraries: ``jl`` and the sub-packages load them late.
 """
@@ -173,7 +173,9 @@ def named(must: str, pair: str) -> tuple[str, str]:
 
 
 def disturbances(option: str, pairs: Sequence[str]) -> dict[str, tuple[float, ...]]:
-    """What was given as NAME=SIZE or NAME=FROM:TO, several times: name -> (size,) or (from, to)."""
+    """Read options of the form NAME=SIZE or NAME=FROM:TO, given several times: name -> (size,) or
+    (from, to).
+    """
     sizes: dict[str, tuple[float, ...]] = {}
     must = f"{option} must be NAME=SIZE or NAME=FROM:TO"
     for pair in pairs:
@@ -246,7 +248,7 @@ def print_summary(summary: Mapping[str, Any]) -> None:
 
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:
-    """What the simulation made of it."""
+    """Print distance, rise, landing and failed checks of a simulation."""
     lengths = (metrics["foot_distance_m"], metrics["com_rise_m"])
     distance, rise = ("none" if x is None else f"{x:.3f} m" for x in lengths)
     print(f"simulated: distance {distance}, rise {rise}")

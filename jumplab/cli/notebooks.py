@@ -86,8 +86,8 @@ def check_value(name: str, value: Any, kind: type | range | None) -> None:
 
 
 def declared_parameters(notebook: Path) -> Kinds:
-    """What the parameters of a notebook may be, see :func:`check_parameters`; read without running
-    it. Raises :class:`InputError` if it cannot be read.
+    """Kinds of the parameters of a notebook, see :func:`check_parameters`; read without running it.
+    Raises :class:`InputError` if it cannot be read.
     """
     from papermill import inspect_notebook
 
@@ -114,7 +114,7 @@ def _literal(path: Path) -> str:
 
 @dataclass(frozen=True)
 class RunReport:
-    """Where a finished chain of notebooks put its things, and how long it took."""
+    """Places of the results of a finished chain of notebooks, and its duration."""
 
     out: Path  # result folder: plan, simulation, and the executed notebooks in ``notebooks``
     figures: Path

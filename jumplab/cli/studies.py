@@ -223,7 +223,9 @@ def envelope(args: Namespace) -> None:
 
 
 def record(args: Namespace) -> None:
-    """How far a robot can go in one number of the target, what ends it, what more would buy."""
+    """Find the largest distance, rise or other number of the target that a robot reaches, and the
+    limits that end it.
+    """
     numbers = {name: getattr(args, name) for name in TARGET if getattr(args, name) is not None}
     task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers) if numbers else None
     options = given(studies.record.record, args, given=task)
@@ -301,8 +303,8 @@ def sweep(args: Namespace) -> None:
 
 
 def bench(args: Namespace) -> None:
-    """How long planning takes: straight ahead, from a neighbour, from an atlas, in three steps,
-    aside, flips.
+    """Measure the time of planning: straight ahead, from a neighbour, from an atlas, in three
+    steps, aside, flips.
     """
     task = JumpTask(args.distance_m, args.height_m)
     benchmark = paper("planning_times")
