@@ -162,7 +162,7 @@ class LaunchFeedback:
         return (wrench[:, 3:] + np.cross(arms, wrench[:, :3])).sum(axis=0)
 
     def to_json(self) -> dict:
-        """What the settings of a result say."""
+        """Counts and deviations of the launch, for the settings of a result."""
         return {
             "solves": self.solver.solves,
             "failures": self.solver.failures,
@@ -244,8 +244,8 @@ class LaunchFeedback:
     def _solve(
         self, due: int, stand: Stand, q: np.ndarray, v: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """What the joints' accelerations (nv - 6,) shall differ by from those of the tape's step
-        ``due``, and the motors' torques (nv - 6,) with that [N m], None without a solution.
+        """Differences (nv - 6,) from the tape's joint accelerations at step ``due``, and the
+        motors' torques (nv - 6,) with them [N m], None without a solution.
         """
         body = self._body
         carries = np.array(stand) > tapes.AIR

@@ -69,7 +69,7 @@ UNITS = np.repeat([1.0, LEVER_M], 3)
 
 @dataclass(frozen=True)
 class Drive:
-    """What the joints' drives are sent: a torque, and angles and rates to hold.
+    """Values that are sent to the joints' drives: a torque, and angles and rates to hold.
 
     A drive gives tau + kp (q - its angle) + kd (rate - its rate) from its own encoder, until
     something newer arrives.
@@ -113,7 +113,7 @@ class PositionServo:
         self.kd = np.minimum(STIFFNESS_TIME_S * self.kp, MOST_KD * inertia / STEP_S)
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
-        """What is sent for ``command``; the measured (q, v) are not used."""
+        """Values to send for ``command``; the measured (q, v) are not used."""
         ahead = command.q + (command.tau + self._late * command.change) / self.kp
         return Drive(0.0, ahead, command.rate, self.kp, self.kd)
 
@@ -143,7 +143,7 @@ class TorqueServo:
         self._legs = [leg - 6 for leg in leg_columns(robot)]
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
-        """What is sent for ``command`` at the measured (q, v)."""
+        """Values to send for ``command`` at the measured (q, v)."""
         tau = command.tau + self._late * command.change
         error = command.q - q[7:]
         rate_error = command.rate - v[6:]
@@ -185,7 +185,7 @@ class WholeBodyServo:
         self._anchors = {stand: on_feet(robot, at) for stand, at in self._pivots.items()}
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
-        """What is sent for ``command`` at the measured (q, v)."""
+        """Values to send for ``command`` at the measured (q, v)."""
         return Drive(self.torque(command, q, v))
 
     def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
