@@ -32,7 +32,7 @@ class Rows(Shown, tuple):
     __slots__ = ()
 
     def line(self) -> str:
-        """How many there are."""
+        """Number of rows."""
         return f"{len(self)} rows"
 
     __repr__ = tuple.__repr__

@@ -25,7 +25,7 @@ END_TOLERANCE = 1e-9  # [s], so that a grid of k / rate reaches the last sample 
 
 @runtime_checkable
 class Record(Protocol):
-    """What a motion is made from: a ``Tape`` or a ``SimulationResult``."""
+    """Record of a jump from which a motion is made: a ``Tape`` or a ``SimulationResult``."""
 
     t: np.ndarray
     q: np.ndarray

@@ -54,7 +54,7 @@ class Whole:
         self._jumping = self._columns(robot.joint_names)
 
     def _columns(self, names: Iterable[str]) -> np.ndarray:
-        """Where joints are in Pinocchio's order, behind the base."""
+        """Columns of joints in Pinocchio's order, counted behind the base."""
         columns = [self.model.idx_vs[self.model.getJointId(name)] - 6 for name in names]
         return np.array(columns, int)
 
