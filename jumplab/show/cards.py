@@ -128,7 +128,7 @@ def _of_audit(report: AuditReport) -> Card:
 
 @themed
 def _shares(report: AuditReport) -> Figure | None:
-    """How much of its limit each check uses, the fullest above."""
+    """Bars: the share of its limit that each check uses, the largest above."""
     used = sorted(
         (100 * check.value / check.limit, check.name)
         for check in report.checks

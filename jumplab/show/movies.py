@@ -156,8 +156,8 @@ def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Sce
 
 
 def camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
-    """Where the camera looks (n, 3) [m] along the way, and its distance [m]; it stands still unless
-    the jump is long.
+    """Points (n, 3) [m] at which the camera looks along the way, and its distance [m]; it stands
+    still unless the jump is long.
     """
     base = way.joints[:, 0, :2]
     height = way.joints[..., 2].max(axis=1)  # of the highest joint

@@ -151,7 +151,7 @@ def _ground(scene: Scene, span: tuple[float, float]) -> tuple[list[dict[str, Any
 # the motion
 # ----------------------------------------------------------------------------------------------
 def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, Any]:
-    """What the page plays of a motion that goes this way."""
+    """Data with which the page plays a motion that goes this way."""
     motion = whole.every(FPS)
     forces = ground_forces(whole, FPS, way, scene)
     words = [_words(*row) for row in zip(motion.phase, motion.contact, strict=True)]

@@ -39,7 +39,7 @@ def waiting(out: TextIO, head: str = "") -> Iterator[None]:
 
 
 def on_terminal(command: str) -> contextlib.AbstractContextManager:
-    """What a ``command`` is doing, on stderr if that is a terminal."""
+    """Show the progress of a ``command`` on stderr, if that is a terminal."""
     out = sys.stderr
     return waiting(out, f"jumplab {command}: ") if out.isatty() else contextlib.nullcontext()
 
