@@ -24,7 +24,7 @@ from jumplab.sim.scene import REACH_M, Contacts
 
 @dataclass(frozen=True)
 class Contact:
-    """How contacts are solved: options of PyBullet's engine, which has defaults of its own."""
+    """Contact model: options of PyBullet's engine, which has defaults of its own."""
 
     options: dict[str, float] = field(default_factory=dict)
     substeps: int = 1  # in one step of the simulation
@@ -218,8 +218,9 @@ class BulletEngine(Engine):
         return bool(self._bullet.getContactPoints(bodyA=self._body, bodyB=self._body))
 
     def kept(self) -> Kept:
-        """What the engine has; damping, armature and friction of the motors come in :meth:`step`,
-        and the inertia that links are lent is given back there."""
+        """Quantities that the engine really has; damping, armature and friction of the motors come
+        in :meth:`step`, and the inertia that links are lent is given back there.
+        """
         rows = {
             link: self._bullet.getDynamicsInfo(self._body, i)
             for i, link in enumerate(self.links, -1)

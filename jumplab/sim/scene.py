@@ -1,4 +1,4 @@
-"""What the robot stands and lands on, boxes with even tops and real edges; and what it touches."""
+"""Ground to stand and to land on, boxes with even tops and real edges; and contacts with it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ GAP_M = 0.02
 
 @dataclass(frozen=True)
 class Contacts:
-    """What touched in one step."""
+    """Contacts of the robot in one step."""
 
     # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
     wrench: np.ndarray
@@ -216,8 +216,8 @@ class Scene:
         return normals[number] @ about_vertical(self.along_rad).T
 
     def depth_of(self, points: np.ndarray, soft: bool = True) -> np.ndarray:
-        """How deep (...) the lowest of each k ``points`` (..., k, 3) of the world lies in the
-        ground, in ``soft`` ground alone if wanted [m].
+        """Depth (...) below the ground's surface of the lowest of k ``points`` (..., k, 3) of the
+        world [m]; in ``soft`` ground alone, where that is asked.
         """
         number, top = self._highest(self.along(points))
         deep = top - points[..., 2]
@@ -270,8 +270,8 @@ class Scene:
         return replace(scene, name=f"{scene.name}, landing moved", blocks=tuple(blocks))
 
     def height_of(self, q: np.ndarray, robot: Robot, planned: Scene) -> float:
-        """How much higher the ground is than the blocks of the ``planned`` scene, under the soles
-        of ``q`` [m].
+        """Height of the ground over the blocks of the ``planned`` scene, under the soles of ``q``
+        [m].
         """
         soles = Gauge(robot).soles(shaped(q, (robot.model.nq,), "q"))
         real, height = self.below(soles)
