@@ -1,4 +1,5 @@
-"""What a term of stage 2 sees of a step: numbers, and quantities that are affine in its unknowns.
+"""Quantities of a step that a term of stage 2 can use: numbers, and expressions that are affine in
+the step's unknowns.
 
 >>> still = jl.Term("still hands", "ours", "m/s^2", "node",
 ...                 lambda p: p.point("left_hand").acceleration, weight=1e-3)

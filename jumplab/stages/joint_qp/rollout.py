@@ -59,7 +59,7 @@ AT_NODES = Step._fields[:6]  # what a plan holds at every node
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the roll-out cost: steps, solver iterations, and time [s] in the solver and in all."""
+    """Effort of the roll-out: steps, solver iterations, and time [s] in the solver and in all."""
 
     steps: int
     iterations: int

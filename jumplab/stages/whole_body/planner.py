@@ -295,7 +295,7 @@ class WholeBodyPlanner:
         return best
 
     def _explained(self, program: Program, asked: Asked) -> SolverError | None:
-        """Why there is no plan: the terms in conflict, by a short search."""
+        """Reason for the lack of a plan: the terms in conflict, by a short search."""
         start = replace(COLD[1], patience=EXPLAINING)
         try:
             program.solve(replace(asked, attempts=[]), start, explain=True)
