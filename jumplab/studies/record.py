@@ -1,5 +1,5 @@
-"""How far a robot can go in one number of the target, what ends it, and what more of each limit
-would buy.
+"""Records of a robot in one number of the target, the limits that end them, and the gain per unit
+of each limit.
 
 The number is an unknown of the whole-body program and as large as can be. A local solver speaks,
 from several easy jumps: a record is what it found "at least".
@@ -149,8 +149,8 @@ class Record(Shown):
         return f" and at most {self.bound:.2f} {self.unit}{by}"
 
     def prices(self, most: int = MOST) -> Prices:
-        """What more of the ``most`` dearest limits of joints would buy, and of friction, mass and
-        legs [m or rad per unit]; each checked by a record with it moved (a second or two).
+        """Gain per unit of the ``most`` limits of joints with the highest price, and of friction,
+        mass and legs [m or rad per unit]; each checked by a record with it moved (a second or two).
         """
         return priced(self, most)
 
@@ -267,7 +267,7 @@ class _Search:
             yield self.at(max(best, key=lambda x: x[0])[1], share)
 
     def from_easy(self) -> tuple[dict[str, float], Solved]:
-        """What came of each start, and the best one."""
+        """Results of all starts, and the best one."""
         found: dict[str, float] = {}
         best: list[tuple] = []
         refusal = None

@@ -135,8 +135,8 @@ def opposite(drawn: Perturbation) -> Perturbation:
 
 
 def capture_point(model: SpatialModel, body: Body, ends: Mapping[str, SimpleNamespace]) -> ca.SX:
-    """Where another robot that makes this motion comes to rest (2,), from the middle of its soles
-    [m].
+    """Point where another robot that makes this motion comes to rest (2,), from the middle of its
+    soles [m].
 
     Its joints move as planned, and its feet with them until take-off: there it has the momentum
     that its own masses give. In flight that stays, and the body turns by I^-1 (L - L of the joints

@@ -69,7 +69,9 @@ def key_of(*decisive: Any) -> str:
 
 
 def deciding() -> dict[str, str]:
-    """What decides results besides their case, here: the code, and versions of packages."""
+    """Words for all that decides results besides their case: the code here, and versions of
+    packages.
+    """
     versions = store.versions()
     return {"code": code()} | {name: versions[name] for name in DECIDING}
 
