@@ -21,6 +21,7 @@ from jumplab.task import FRICTION
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").glob("*.py"))
+PAPER = sorted((ROOT / "notebooks" / "paper").glob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BOOK = ROOT / "notebooks" / "book"
@@ -170,6 +171,22 @@ def test_these_checks_can_fail():
     assert undocumented(tree) == ["A.f", "g"] and list(long_functions(tree)) == ["g"]
     assert undocumented(ast.parse("x = 1")) == [""]
     assert unhinted(tree) == ["A.f", "g"] and not unhinted(ast.parse("def f(x: int, *, y: str = '') -> None: ..."))
+
+
+def riddles(tree):
+    """Docstrings, of private names too, that begin with a question word instead of a noun or a verb."""
+    nodes = (node for node in ast.walk(tree) if isinstance(node, FUNCTIONS | ast.ClassDef | ast.Module))
+    docs = (ast.get_docstring(node) or "" for node in nodes)
+    return [doc.partition("\n")[0] for doc in docs if re.match(r"(?:What|How|Where|Who|Whose|Why)\b", doc)]
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb():
+    assert riddles(ast.parse('"""What it is."""\nclass A:\n    """Whether."""\n    def _f():\n        "How far."')) == [
+        "What it is.",
+        "How far.",
+    ]
+    found = {short(path): riddles(ast.parse(path.read_text(encoding="utf-8"))) for path in [*MODULES, *PAPER]}
+    assert not {name: docs for name, docs in found.items() if docs}
 
 
 def torn(doc):

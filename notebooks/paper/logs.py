@@ -61,7 +61,9 @@ class _Bare(ast.NodeTransformer):
 
 
 def stamp(folder: str | Path | None = None, robot: Robot | None = None) -> Row:
-    """Who makes rows now: code, versions, machine; the plan of a result folder and a robot, where a study is of one."""
+    """Stamp of rows that are made now: code, versions, machine; plan of a result folder and robot, where a study is of
+    one.
+    """
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     made = {"code": code(), "version": versions()["jumplab"], "machine": machine}
     if folder is not None:
@@ -72,7 +74,7 @@ def stamp(folder: str | Path | None = None, robot: Robot | None = None) -> Row:
 
 
 def age(stamps: Iterable[Mapping[str, Any] | None]) -> str:
-    """How many rows, each given by its stamp or None, are of the code of now, and what changed since the others.
+    """Number of rows, each given by its stamp or None, that are of the code of now, and the changes since the others.
 
     A file that came later does not count: it can only matter through a change of one that was there.
     """
@@ -147,7 +149,7 @@ def write(path: Path, found: Iterable[Row], **of: Any) -> None:
 
 
 def table(path: Path, say: Callable[[str], Any] = print) -> Any:
-    """What :func:`write_table` has written, or a table without a stamp, after a line that says how old it is."""
+    """Content of a table by :func:`write_table`, or of one without a stamp, after a line on its age."""
     found = json.loads(path.read_text(encoding="utf-8"))
     made = found.get(STAMP) if isinstance(found, dict) else None
     inner = found if made is None else found["table"]

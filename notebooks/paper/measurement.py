@@ -1,4 +1,4 @@
-"""What a laboratory could know of a jump: estimated from simulated, noisy sensors with the planned robot's model."""
+"""Measurements of a jump in a laboratory: estimates from simulated, noisy sensors with the planned robot's model."""
 
 from __future__ import annotations
 

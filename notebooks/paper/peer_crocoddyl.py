@@ -100,7 +100,7 @@ class Jump:
         return node
 
     def measured(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, n: int, steps: np.ndarray) -> dict[str, float]:
-        """What a motion does: travel, rise from take-off at row ``n``, largest shares of torque and speed, effort."""
+        """Measures of a motion: travel, rise from take-off at row ``n``, largest shares of torque and speed, effort."""
         pin.forwardKinematics(self.model, self.data, q[-1])
         pin.updateFramePlacements(self.model, self.data)
         ends = [self.data.oMf[foot].translation[0] for foot in self.feet]

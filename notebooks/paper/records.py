@@ -103,7 +103,7 @@ def records_table() -> Table:
 
 
 def bounds_table(robot: Robot, rises_m: Sequence[float]) -> Table:
-    """What no motion of a robot exceeds, a row a rise."""
+    """Bounds that no motion of a robot exceeds, a row a rise."""
     body = Body(robot)
     rows = []
     for rise in rises_m:

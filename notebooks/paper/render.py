@@ -47,7 +47,7 @@ BELOW_M = 0.14  # seen below the ground
 
 @dataclass(frozen=True)
 class Camera:
-    """What the picture shows, in the plane through ``x`` that faces the camera."""
+    """Camera of a picture, of the plane through ``x`` that faces it."""
 
     width: float = 1.3  # [m], enough for stretched arms
     bottom: float = -BELOW_M  # [m]
@@ -64,7 +64,7 @@ class Camera:
 
     @property
     def axes(self) -> np.ndarray:
-        """Where right, up and away from the camera point (3, 3), world axes, one per row."""
+        """Directions right, up and away of the camera (3, 3), world axes, one per row."""
         (cy, sy), (cp, sp) = ((np.cos(a), np.sin(a)) for a in np.radians([self.yaw_deg, self.pitch_deg]))
         right, away = np.array([cy, sy, 0.0]), np.array([-sy * cp, cy * cp, sp])
         return np.array([right, np.cross(right, away), away])

@@ -49,7 +49,7 @@ AT_TAKEOFF = "base rows at take-off"  # of the flight, its first node
 
 @dataclass(frozen=True)
 class PrintedPlan:
-    """What the printed problems came to for one target.
+    """Result of the printed problems for one target.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What belongs to a notebook that somebody looks at: counted loops, and whether anybody does.
+"""Loops with a counter, and whether a notebook is open in an editor, where it can be seen.
 
 A cell that takes long shows what its work says of itself (:mod:`jumplab.show.waiting`); a notebook that papermill
 executes shows nothing.

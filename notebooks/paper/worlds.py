@@ -273,7 +273,7 @@ def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def share(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """How many of the re-aimed robots of ``rows`` land, with Wilson's 95 % interval, and what the falls begin with."""
+    """Number of the re-aimed robots of ``rows`` that land, with Wilson's 95 % interval, and the causes of the falls."""
     landed = sum(r["landed"] for r in rows)
     low, high = wilson(landed, len(rows))
     causes = Counter(r["cause"] for r in rows if not r["landed"]).most_common()
