@@ -86,7 +86,9 @@ def test_chain_in_an_odd_place_under_this_very_python(odd_folder, monkeypatch):
 
 
 def test_figures_that_look_the_same_stay(tmp_path):
-    """A picture is replaced, with its PDF and caption, where it shows; other files and damaged pictures always."""
+    """A picture is replaced, with its PDF and caption, where it shows; a caption alone where its words changed, not only
+    the versions in its last line; other files and damaged pictures always.
+    """
     work, out, figures = (tmp_path / name for name in ("work", "out", "figures"))
     for folder in (work / "figures", work / "result", out, figures):
         folder.mkdir(parents=True)
@@ -97,11 +99,14 @@ def test_figures_that_look_the_same_stay(tmp_path):
         Image.fromarray(old).save(figures / f"{name}.png")
         Image.fromarray(new).save(work / "figures" / f"{name}.png")
     for folder, text in ((figures, "old"), (work / "figures", "new")):
-        for name in ("same.txt", "faint.pdf", "other.txt", "damaged.png", "alone.txt"):
+        for name in ("faint.pdf", "other.txt", "damaged.png", "alone.txt"):
             (folder / name).write_text(text)
+        (folder / "faint.txt").write_text(f"A caption, {text}.\nMade with a package.\n")
+        (folder / "same.txt").write_text(f"A caption.\nMade with a package, {text}.\n")
     notebooks.publish(work, out, figures)
-    texts = {name: (figures / name).read_text() for name in ("same.txt", "faint.pdf", "other.txt", "alone.txt")}
-    assert texts == {"same.txt": "old", "faint.pdf": "old", "other.txt": "new", "alone.txt": "new"}
+    texts = {path.name: path.read_text() for path in figures.iterdir() if path.suffix in (".txt", ".pdf")}
+    assert texts.pop("same.txt").endswith("old.\n") and texts.pop("faint.txt").startswith("A caption, new.")
+    assert texts == {"faint.pdf": "old", "other.txt": "new", "alone.txt": "new"}
     assert np.asarray(Image.open(figures / "other.png"))[0].max() == 0
     assert (figures / "damaged.png").read_text() == "new"
 

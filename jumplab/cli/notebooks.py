@@ -342,7 +342,9 @@ def _kernel(scratch: str, notebook: Path, work: Path, groups: list[int]) -> type
 
 
 def publish(work: Path, out: Path, figures: Path) -> None:
-    """Move the results in ``work`` to ``out``, and its figures, but those that look the same."""
+    """Move the results in ``work`` to ``out``, and its figures, but those that look the same; of
+    these only captions that changed.
+    """
     io.folder.settle()
     with io.folder.transaction(out) as staging:
         for p in (work / "result").iterdir():
@@ -354,8 +356,15 @@ def publish(work: Path, out: Path, figures: Path) -> None:
         p.with_suffix("") for p in files if p.suffix == ".png" and _alike(made / p, figures / p)
     }
     for p in files:
-        if p.with_suffix("") not in same:
-            io.folder.write_file(figures / p, (made / p).read_bytes())
+        old = figures / p
+        kept = p.with_suffix("") in same
+        if not kept or (p.suffix == ".txt" and _caption(made / p) != _caption(old)):
+            io.folder.write_file(old, (made / p).read_bytes())
+
+
+def _caption(path: Path) -> list[str]:
+    """Lines of a figure's text, without its last one, the versions; none if it is missing."""
+    return path.read_text(encoding="utf-8").splitlines()[:-1] if path.is_file() else []
 
 
 def _alike(new: Path, old: Path) -> bool:
