@@ -107,7 +107,7 @@ def plan(
         if not (alone and (contacts is None or like is None)):
             raise InputError(
                 "a contact schedule, or a jump like a clip, is planned by the whole-body program; "
-                "leave method, robust and starts out, and give one of both"
+                "leave method, robust and starts out, and give one of the two"
             )
         with patience(patience_s):
             made = _followed(task, robot, contacts, like, changes)

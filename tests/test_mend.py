@@ -110,7 +110,7 @@ def test_what_no_clip_shows_is_refused():
         jl.plan(jl.JumpTask(0.5, 0.3, platform_m=0.1), "g1", like=CLIPS / "jump_forward_level2.pkl")
     with pytest.raises(InputError, match="its feet carry as LR R r - L LR; a jump to a target is like one"):
         jl.plan(GOAL, "g1", like=CLIPS / "side_jump_level2.pkl")
-    with pytest.raises(InputError, match="leave method, robust and starts out, and give one of both"):
+    with pytest.raises(InputError, match="leave method, robust and starts out, and give one of the two"):
         jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl", method="three-step")
 
 

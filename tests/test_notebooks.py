@@ -86,8 +86,8 @@ def test_chain_in_an_odd_place_under_this_very_python(odd_folder, monkeypatch):
 
 
 def test_figures_that_look_the_same_stay(tmp_path):
-    """A picture is replaced, with its PDF and caption, where it shows; a caption alone where its words changed, not only
-    the versions in its last line; other files and damaged pictures always.
+    """A picture is replaced, with its PDF and caption, where it shows; a caption alone where its words changed, not
+    just the versions in its last line; other files and damaged pictures always.
     """
     work, out, figures = (tmp_path / name for name in ("work", "out", "figures"))
     for folder in (work / "figures", work / "result", out, figures):
@@ -217,7 +217,7 @@ def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
     path.unlink()
     monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", tmp_path)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=r"^no notebooks in '.*notebooks' nor in '.*notebooks'; install jumplab anew$"):
+    with pytest.raises(InputError, match=r"^no notebooks in '.*notebooks' nor in '.*'; install jumplab again$"):
         notebooks.find_notebooks()
 
 

@@ -110,7 +110,8 @@ def declare(
         options = dict(OPTIONS[name])
         example = options.pop("example", None)
         help_ = text[:1].lower() + text[1:].rstrip(".")
-        one = below.add_parser(name, help=help_, epilog=example and f"example: jumplab {example}")
+        example = example and f"example: jumplab {example}"
+        one = below.add_parser(name, help=help_, description=text, epilog=example)
         one.set_defaults(work=work)
         shared = {usage: OPTIONS["shared"][usage] for usage in options.pop("shared", ())}
         for usage, how in (shared | options).items():
@@ -193,7 +194,7 @@ def without(args: argparse.Namespace, why: str, **options: Any) -> None:
     """
     for name, default in options.items():
         if getattr(args, name) != default:
-            raise InputError(f"--{name.replace('_', '-')} {why}; leave it away")
+            raise InputError(f"--{name.replace('_', '-')} {why}; leave it out")
 
 
 def given(function: Callable, args: argparse.Namespace, **more: Any) -> dict[str, Any]:
@@ -214,7 +215,7 @@ def resumed(function: Callable, args: argparse.Namespace, kept: str = "trials", 
         return function(**given(function, args, **more))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted; finished {kept} are kept, and the same command goes on from there"
+            f"interrupted; finished {kept} are kept, and the same command resumes from there"
         ) from None
 
 

@@ -41,7 +41,7 @@ INTERNAL = 4
 
 
 def completion(args: argparse.Namespace) -> None:
-    """Completion of commands and options: eval "$(jumplab completion bash)"."""
+    """Print the completion of commands and options: eval "$(jumplab completion bash)"."""
     import shtab
 
     args.found["script"] = shtab.complete(make_parser(), args.shell)

@@ -133,7 +133,7 @@ def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
     paths = next(filter(None, (sorted(place.glob(PATTERN)) for place in places)), None)
     if paths is None:
         there = " nor in ".join(repr(str(place)) for place in places)
-        raise InputError(f"no notebooks in {there}; install jumplab anew")
+        raise InputError(f"no notebooks in {there}; install jumplab again")
     named = {name: path for path in paths for name in (path.stem, path.stem[:2])}
     for name in names:
         if name not in named:

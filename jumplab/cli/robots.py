@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # help of a command is there before NumPy is
 
 
 def list_(args: Namespace) -> None:
-    """The shipped robots."""
+    """List the robots that have a name."""
     from jumplab.robot.files import SHIPPED
     from jumplab.robot_import.urdf import DESCRIPTIONS
 
@@ -59,7 +59,7 @@ def check(args: Namespace) -> None:
     if args.repair and (args.config is not None or shipped):
         raise InputError(
             "--repair is for a bare URDF; a configuration has its own [source] repair, so leave it "
-            "away"
+            "out"
         )
     if args.config is not None:
         try:
@@ -91,7 +91,7 @@ def check(args: Namespace) -> None:
 
 
 def robot(args: Namespace) -> None:
-    """The robots that are there, and whether a URDF can jump."""
+    """List the robots that have a name, or check whether a URDF can jump."""
     raise InputError(
         "jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is "
         "possible"

@@ -147,7 +147,7 @@ def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Sce
             raise InputError("a movie of a robot needs its record, a tape or a simulation")
         return of, record, scene or Scene.flat()
     if record is not None:
-        raise InputError("a movie of a plan or a simulation takes no other record; leave it away")
+        raise InputError("a movie of a plan or a simulation takes no other record; leave it out")
     if isinstance(of, JumpPlan):
         return of.robot, of.tape, scene or Scene.of_plan(of.summary, of.robot)
     if of.robot is None:
