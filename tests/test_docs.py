@@ -241,7 +241,7 @@ CLEAN = r"\bclean(?:ly|er|est)?\b"  # in prose: a plan passes the audit, ground 
 
 
 def prose():
-    """(where, text) of all that users read: notebooks with their captions and messages, README, book, help."""
+    """(where, text) of all that people read: notebooks with captions and messages, README, book, help, docstrings."""
     for path in NOTEBOOKS:
         for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
             source = "".join(cell["source"])
@@ -257,6 +257,10 @@ def prose():
     yield "options.toml", (ROOT / "jumplab" / "cli" / "options.toml").read_text(encoding="utf-8")
     for path in MODULES:
         yield from ((short(path), text) for text in texts_of(path.read_text(encoding="utf-8"), sentences=True))
+    for path in (*MODULES, *PAPER):
+        nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        docs = (ast.get_docstring(node) for node in nodes if isinstance(node, FUNCTIONS | ast.ClassDef | ast.Module))
+        yield from ((short(path), re.sub(r"^(?:>>>|\.\.\.) .*$", "", doc, flags=re.M)) for doc in docs if doc)
 
 
 def texts_of(source, *, sentences=False):

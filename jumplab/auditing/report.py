@@ -114,7 +114,7 @@ class AuditReport(Shown):
     ``capture`` is none of the checks: how far outside the soles the robot would come to rest from
     the momentum that it lands with; None of what is no standing jump. A plan can be sound and still
     not be caught.
-    The manifest tells robot and its hash, target, number of samples, package versions;
+    The manifest has robot and its hash, target, number of samples, package versions;
     :func:`jumplab.auditing.write_audit` adds the plan's digest and the planner's own summary.
     """
 
@@ -134,7 +134,9 @@ class AuditReport(Shown):
 
     @property
     def sound(self) -> bool:
-        """True if every check passed, and nothing speaks against catching the landing."""
+        """True if every check passed, and the landing can be caught as far as the capture point
+        shows.
+        """
         return self.passed and not self.uncaught
 
     @property

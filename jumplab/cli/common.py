@@ -220,7 +220,7 @@ def resumed(function: Callable, args: argparse.Namespace, kept: str = "trials", 
 
 
 def judge(audit: Any, folder: str) -> None:
-    """Say that the audit of the plan in ``folder`` is clean, or refuse it
+    """Say that the plan in ``folder`` passes its audit, or refuse it
     (:class:`InfeasibleError`).
     """
     count = len(audit.checks)

@@ -153,6 +153,6 @@ def _main(argv: list[str], alone: bool) -> int:
 
         print(to_json({**results, "exit_code": code, "error": sentence}), end="", flush=True)
     if alone and interrupts.number is not None:
-        logging.disable()  # papermill would tell that its kernel has died
+        logging.disable()  # papermill would print that its kernel has died
         end_soon(code)
     return code

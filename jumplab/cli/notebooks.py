@@ -48,7 +48,7 @@ def check_parameters(namespace: Mapping[str, Any]) -> None:
     that cannot be meant.
 
     papermill merely warns of an unknown name and then runs with the default. Call this in the cell
-    after the parameters, with its ``globals()``. What a parameter may be stands in the parameters'
+    after the parameters, with its ``globals()``. The kind of a parameter stands in the parameters'
     cell: its annotation and, of a whole number, a comment that begins with the range, as in
     ``samples: int = 200  # 1 ... 10000, random states``. An ``engine`` must be there.
     """

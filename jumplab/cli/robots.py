@@ -127,8 +127,8 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
 
 
 def _write(folder: Path, text: str, force: bool) -> Path:
-    """Write a starter configuration, but not over another one, which somebody may have edited; its
-    path.
+    """Write a starter configuration, but not over another one, which a user may have edited;
+    returns its path.
     """
     from jumplab.robot import files
 

@@ -2,9 +2,9 @@
 error-state Kalman filter.
 
 The trunk is integrated from gyro and accelerometer. While a foot carries weight, the point it
-stands on does not move: the legs' angles then tell where the trunk is, and through gravity also how
-it is tilted. That feet are part of the state is an idea of Bloesch et al., "State estimation for
-legged robots" (2012).
+stands on does not move: the legs' angles then give the place of the trunk, and through gravity also
+its tilt. That feet are part of the state is an idea of Bloesch et al., "State estimation for legged
+robots" (2012).
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ class State(NamedTuple):
     wrench: np.ndarray
 
     def along(self, heading_rad: float) -> State:
-        """The same, as somebody sees it who looks along a heading."""
+        """The same, as seen along a heading."""
         if heading_rad == 0:
             return self
         return State(headed(self.q, heading_rad), self.v, turned_wrench(self.wrench, heading_rad))
@@ -71,7 +71,7 @@ def pitch_of(q: np.ndarray) -> np.ndarray:
 
 
 def headed(q: np.ndarray, heading_rad: float) -> np.ndarray:
-    """Configurations (..., nq) as somebody sees them who looks along ``heading_rad``; ``q`` itself
+    """Configurations (..., nq) as seen along ``heading_rad``; ``q`` itself
     if that is zero.
     """
     if heading_rad == 0:
@@ -85,7 +85,7 @@ def headed(q: np.ndarray, heading_rad: float) -> np.ndarray:
 
 
 def turned_wrench(wrench: np.ndarray, heading_rad: float) -> np.ndarray:
-    """Wrenches (..., 6) as somebody sees them who looks along ``heading_rad``."""
+    """Wrenches (..., 6) as seen along ``heading_rad``."""
     halves = wrench.reshape(*wrench.shape[:-1], 2, 3) @ about_vertical(heading_rad)
     return halves.reshape(wrench.shape)
 

@@ -1,9 +1,9 @@
 """Optional correction in flight: legs are put where they can catch the robot.
 
 A shove, or a robot unlike its plan, leaves speed, momentum and attitude other than planned, about
-all axes. What flies can no longer change the first two; where the soles meet the ground it still
-can. Legs that swing forward turn the trunk forward, and arms that swing back hold it: where the
-trunk will be far off its plan, both are reckoned with.
+all axes. A flying robot can no longer change the first two; where the soles meet the ground it
+still can. Legs that swing forward turn the trunk forward, and arms that swing back hold it: where
+the trunk will be far off its plan, both are reckoned with.
 """
 
 from __future__ import annotations

@@ -3,13 +3,13 @@
 "position" are drives that hold angles, "pd" adds their errors to the planned torque, "whole-body"
 measures base and joints and sees no planned torque. That one sums what the motion takes and what
 its errors ask for, both from the planned robot at the measured state and with the feet standing as
-they do in the plan. What the joints' accelerations a_j take is inverse dynamics; those of the base
-a_b and the wrenches f on the feet go with it,
+they do in the plan. The torques for the joints' accelerations a_j are inverse dynamics; those of
+the base a_b and the wrenches f on the feet go with it,
 
     min over a_b, f   1/2 |J a + J' v|^2 + epsilon/2 |f - f_p|^2   so that   M a + h = J^T f   in
     the rows of the base,
 
-where f_p is the plan's: what feet push against each other no joint's motion tells.
+where f_p is the plan's: no joint's motion shows how feet push against each other.
 
 Errors are met by damping d, which acts on the velocity v+ that the step ends with, so that it may
 be far stiffer than what is computed from the velocity before the step,
@@ -89,17 +89,17 @@ class Drive:
 
 
 class PositionServo:
-    """Position drives: each joint is sent an angle and a rate, and measures its own; nobody knows
+    """Position drives: each joint is sent an angle and a rate, and measures its own; no drive knows
     the base, the feet or another joint.
 
     Where a drive has no error it gives no torque, so the angle that is sent lies ahead of the
     planned one by the planned torque over the stiffness, also beyond the joint's range: cut off
-    there, a joint near its stop would get too little torque.
-    Stiffness is scaled by a motor's effort, damping by the stiffness, both within what a cycle of
-    1 ms can hold on the joint's own inertia, that of the robot in its stance with all other joints
-    free. ``late_s`` makes no difference here: the loop is closed in the drive. What is held for a
-    step, which a simulator takes in ``substeps`` semi-implicit ones, is felt (1 - 1/substeps) / 2
-    of it late on average, and planned torques change meanwhile.
+    there, a joint near its stop would get too little torque. Stiffness is scaled by a motor's
+    effort, damping by the stiffness, both within what a cycle of 1 ms can hold on the joint's own
+    inertia, that of the robot in its stance with all other joints free. ``late_s`` makes no
+    difference here: the loop is closed in the drive. A torque that is held for a step, which a
+    simulator takes in ``substeps`` semi-implicit ones, is felt (1 - 1/substeps) / 2 of it late on
+    average, and planned torques change meanwhile.
     """
 
     told = "target angles and rates; a drive measures its own joint"

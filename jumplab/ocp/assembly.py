@@ -39,7 +39,7 @@ class Assembled:
     size, n_rows, p_size : numbers of variables, rows and data; p = [parameters; weights; per phase
         (share of the phase, references) of every node].
     rows, cost_terms : what the rows are; (owner, term) of every cost.
-    nlp, grad_f, jac_g, hess_lag : cost and rows with derivatives, as ipopt wants them.
+    nlp, grad_f, jac_g, hess_lag : cost and rows with derivatives, as ipopt needs them.
     functions_of_nlp : these four by name, see :func:`nlp_functions`.
     cost_parts, gauss_newton : unweighted costs; upper triangle of the cost's Hessian without the
         curvature of what it squares.

@@ -34,8 +34,8 @@ from jumplab.ocp.problem import Problem
 
 # a problem with terms from elsewhere is not kept, unless it knows the hashes of their expressions
 HOME = ("jumplab.",)
-# modules and rooms that a problem is built by; a test walks the imports of the problems' modules
-# and misses none
+# modules and sub-packages that a problem is built by; a test walks the imports of the problems'
+# modules and misses none
 BUILT_BY = (
     "errors",
     "arguments",

@@ -214,7 +214,7 @@ class Conflict:
 
     # (block, row, amount) that give way in the least total, worst first
     gives: tuple[tuple[str, str, float], ...]
-    # (block, row) of the limits that force them to, dearest first
+    # (block, row) of the limits that force them to, those of the highest price first
     limits: tuple[tuple[str, str], ...]
 
 

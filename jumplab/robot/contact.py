@@ -37,7 +37,7 @@ def wrench_rows(
     """Rows r (6,) by name, with r @ [force, moment] >= 0 while a foot sticks and does not tip.
 
     The wrench is about a point of the sole, in axes that are turned about the vertical as the foot
-    is. The CoP is at (-m_y, m_x) / f_z from that point. What is None has no rows.
+    is. The CoP is at (-m_y, m_x) / f_z from that point. A limit of None has no rows.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from jumplab.robot.contact import WORLD, on_feet
 from jumplab.robot.files import LEG
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, TO_COMPLEX, in_xz
 
-if TYPE_CHECKING:  # a robot is checked by this before anybody gets it
+if TYPE_CHECKING:  # a robot is checked by this before it is returned
     from jumplab.robot.description import Robot
 
 STANCE_ROOM_RAD = 0.04  # plans keep 0.03 off every stop

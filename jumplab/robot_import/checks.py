@@ -372,7 +372,7 @@ def limit_faults(
     """The faults of the limits of one joint that the jump uses, in one sentence, if there are any.
 
     ``given`` as of :func:`wrong_limits`; the sentence advises the ``table`` of the configuration
-    that can tell them.
+    that can hold them.
     """
     if wrong := wrong_limits(tree, joint, given):
         keys = ", ".join(keys_of(wrong))

@@ -128,7 +128,7 @@ def check_texts(urdf: str, config_text: str, where: str = "") -> None:
 
 def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
     """The checkup of a name or of a path, of a bare URDF or MJCF or of a TOML file; roles are found
-    where no table [source] tells them.
+    where no table [source] names them.
     """
     urdf, folder, config = files_of(robot)
     path = locate(urdf, folder)

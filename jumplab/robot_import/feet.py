@@ -90,7 +90,7 @@ def sole_points(
     origin along the axes ``turn`` (3, 3): those that touch level ground, and corners around
     its shapes, which are farther out where these are round; and the kinds of shapes.
 
-    What is drawn counts where nothing collides.
+    Pictures count where there are no collision shapes.
     """
     axes = pin.SE3(turn, -turn @ tree.pose[foot].translation)
     touching = [np.zeros((0, 3))]

@@ -1,8 +1,8 @@
 """A robot of MuJoCo's own format (MJCF), by MuJoCo's compiled model, in the description that URDFs
 end in too: links, joints with range, torque, armature and losses, shapes.
 
-What MJCF has and that description has not (loops, tendons, springs, other things in a scene) is
-named in its ``<note>`` elements.
+Parts of an MJCF that such a description lacks (loops, tendons, springs, other things in a scene)
+are named in its ``<note>`` elements.
 """
 
 from __future__ import annotations

@@ -305,8 +305,8 @@ class Tree:
     """Links and joints of a URDF whose names, connections and inertials have passed the checks.
 
     ``model`` is Pinocchio's with a free base, its joints those that can move, with a frame for each
-    link; ``carrier`` tells which joint moves a link, ``bodies`` which links a joint moves, ``pose``
-    where each is with all joints at 0, in the root's frame [m].
+    link; ``carrier`` has the joint that moves a link, ``bodies`` the links that a joint moves,
+    ``pose`` where each is with all joints at 0, in the root's frame [m].
 
     ``where`` is the name of the file for messages, ``path`` the file itself, near which meshes are
     looked for; ``repair_inertia`` replaces inertias that no solid has by the nearest possible,
@@ -374,7 +374,7 @@ class Tree:
     def holding(self, held: Mapping[str, float], moving: Collection[str]) -> pin.Model:
         """Pinocchio's model whose other joints do not move: they are ``held`` [rad, m], else at 0.
 
-        What floats is not held.
+        Floating joints are not held.
         """
         still = [j for j in self.joints.values() if j.kind in MOVING and j.name not in moving]
         at = np.zeros(self.model.nv)

@@ -53,7 +53,7 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.studies.trials import TrialReport
     from jumplab.task import JumpTask
 
-MOST_BINDING = 12  # limits of a record that are shown, the dearest
+MOST_BINDING = 12  # limits of a record that are shown, those of the highest worth
 MOST_PRICES = 14  # and prices
 Card = tuple[Table, Picture | None]
 

@@ -60,7 +60,7 @@ class Part:
     """A surface that moves with a joint."""
 
     joint: int
-    kind: str  # "trunk" and "limb", whose colour tells the phase, or "rest"
+    kind: str  # "trunk" and "limb", whose colour shows the phase, or "rest"
     points: np.ndarray  # (n, 3) in the joint's frame [m]
     triangles: np.ndarray  # (m, 3) rows of ``points``
     faceted: bool = False  # triangles are seen as flat; else they are parts of a round surface

@@ -1,7 +1,7 @@
 """The 3-D page of a jump: what it shows as data, its player and meshcat's viewer in one file that
 refers to nothing outside itself.
 
-What is computed stands here, how it is drawn in ``player.js``.
+This module computes the data; ``player.js`` draws them.
 """
 
 from __future__ import annotations

@@ -93,8 +93,7 @@ def base_to_bullet(
     [rad/s] of its CoM.
 
     ``q`` (7,), ``v`` (6,) : pose of the link frame and twist in its own axes, further entries
-    unread; ``lever`` (3,) : CoM of the base link in its link frame [m]. What is returned is in
-    world axes.
+    unread; ``lever`` (3,) : CoM of the base link in its link frame [m]. Results are in world axes.
     """
     attitude = rotation(q[3:7])
     velocity = attitude @ (v[:3] + pin.skew(v[3:6]) @ lever)

@@ -2,7 +2,7 @@
 the engine.
 
 The strongest one asks mechanics: the logged motion, torques and foot forces must obey the robot's
-equations of motion. They leave no room for a hand that holds the base, a motor that gives more than
+equations of motion. They exclude a hand that holds the base, a motor that gives more than
 it says, or a velocity set.
 """
 

@@ -71,9 +71,9 @@ class Ranges:
     """Largest differences of robots and worlds: the uniform draws of :meth:`Perturbation.draw`,
     every link and joint by itself.
 
-    A pair is drawn from ... to, a single number is the half-width around nothing. What is beyond
-    the last number of a field's declaration is refused with an :class:`InputError`. From the
-    payload on they are off unless they are asked for.
+    A pair is drawn from ... to, a single number is the half-width around nothing. Values beyond the
+    last number of a field's declaration are refused with an :class:`InputError`. From the payload
+    on they are off unless they are asked for.
     """
 
     mass: float = _up_to(0.05, 0.2, "masses", "%")  # [1], relative

@@ -20,7 +20,8 @@ REACH_M = 20.0  # half-size of "endless" ground, far beyond any jump
 THICKNESS_M = 1.0  # deeper than any contact can push a foot in one step
 UNEVEN_M = 5e-3  # by how much the ground may miss a corner of a sole at the start
 STRAIGHT_RAD = 1e-9  # a heading that differs from +x by rounding alone is straight ahead
-# least room between the soles at the start and at the landing, where the ground of one is to differ
+# least distance between the soles at the start and at the landing, where the ground of one is to
+# differ
 GAP_M = 0.02
 
 

@@ -60,8 +60,8 @@ def advised(
     method: str = USUAL,
     spent_s: float | None = None,
 ) -> JumplabError:
-    """The ``refusal`` again (same type, same fields), ending with an easier target that has a clean
-    plan, or saying which were tried.
+    """The ``refusal`` again (same type, same fields), ending with an easier target that has a plan
+    which passes its audit, or saying which were tried.
 
     Each target that is tried is milder than the one before, in one of its numbers. ``spent_s`` is
     the processor time [s] after which planning was given up, if it was.

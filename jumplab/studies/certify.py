@@ -1,8 +1,8 @@
 """Do two physics agree on a plan? Its audit, then every engine in two modes: the robot as planned,
 and perturbed ones; and the robot as planned on contacts as each engine has them by default.
 
-Engines differ in how feet meet the ground. What a jump owes to that, and not to its plan, shows
-where they are apart.
+Engines differ in how feet meet the ground. Their differences show which part of a jump depends on
+that, and not on its plan.
 """
 
 from __future__ import annotations
@@ -265,7 +265,7 @@ def certify(
     Parameters
     ----------
     n, seed, jobs, progress : as of :func:`jumplab.studies.trials.run_trials`. Finished simulations
-        are kept in ``trials.jsonl``: a stopped run goes on from there.
+        are kept in ``trials.jsonl``: a stopped run resumes from there.
     page : makes the text of ``certificate.html``, written with ``certificate.json``, if there is to
         be one.
 

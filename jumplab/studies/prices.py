@@ -77,7 +77,7 @@ class Price:
 
 @dataclass(frozen=True, repr=False)
 class Prices(Shown):
-    """The prices of a record, dearest first."""
+    """The prices of a record, the highest first."""
 
     what: str
     robot: str

@@ -48,7 +48,7 @@ Plain = dict[str, Any]  # data as JSON has them, of one case for example
 
 # keys ------------------------------------------------------------------------------------------
 def short_hash(data: Any) -> str:
-    """64 bits of a hash of JSON data, enough to tell cases apart."""
+    """64 bits of a hash of JSON data, enough to distinguish cases."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -2,7 +2,7 @@
 order.
 
 A trial is decided by its key alone (seed, number, settings, plan), and every finished one is kept
-at once. A run that is stopped therefore goes on where it was, and gives what it would have given
+at once. A run that is stopped therefore resumes where it was, and gives what it would have given
 undisturbed.
 """
 

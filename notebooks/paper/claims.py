@@ -57,7 +57,8 @@ class Claim:
     ----------
     sentence : what is said, in our words.
     where : notebook that shows it at length.
-    limits : what is measured, with its unit -> least and most for which the claim holds; None if nothing here can tell.
+    limits : what is measured, with its unit -> least and most for which the claim holds; None if nothing here can
+    measure it.
     adopted : whether the measurement reads back what was built so; it can fail, but proves nothing of the paper.
     """
 

@@ -137,8 +137,8 @@ def bounded(path: Path) -> dict[str, Any]:
     """Greatest rise of a robot on the spot for which a plan is found, on a ladder of rises :data:`STEP` apart.
 
     From above what a straight push may give, the ladder is gone down to the first rung with a clean plan by either
-    method, and from there up again, each plan begun with the one below or with a jump ahead. ``refused`` tells by
-    method why there is none on the rung above.
+    method, and from there up again, each plan begun with the one below or with a jump ahead. ``refused`` has the
+    reasons, by method, why there is none on the rung above.
     """
     EXPLAINED.set(False)  # nobody reads why
     planner = Planner(examine(path).robot)

@@ -22,7 +22,7 @@ from jumplab.io.folder import PLAN, sha256, versions
 from jumplab.robot import Robot
 
 Row = dict[str, Any]
-# rooms whose code decides what a study finds; a reading, a picture or a command does not
+# sub-packages whose code decides what a study finds; a reading, a picture or a command does not
 ROOMS = ("robot", "models", "ocp", "stages", "auditing", "control", "sim", "studies")
 STAMP = "stamp"
 NAMED = 3  # changed files in a line
@@ -33,7 +33,9 @@ NAMED = 3  # changed files in a line
 
 @cache
 def code() -> dict[str, str]:
-    """File of the library, ``room/name.py`` -> digest of what it does: comments, docstrings and layout do not count."""
+    """File of the library, ``sub-package/name.py`` -> digest of what it does: comments, docstrings and layout do not
+    count.
+    """
     root = Path(jumplab.__file__).parent
     files = sorted(p for room in ROOMS for p in (root / room).rglob("*") if p.suffix in (".py", ".toml"))
     return {path.relative_to(root).as_posix(): digest(path) for path in files}

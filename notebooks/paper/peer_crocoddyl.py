@@ -1,6 +1,6 @@
 """The same jump by crocoddyl, which knows multiple shooting and DDP and no hard limits: time and quality of its answer.
 
-Crocoddyl wants another Pinocchio than this package, so it runs in an environment of its own:
+Crocoddyl needs another Pinocchio than this package, so it runs in an environment of its own:
 ``pip install crocoddyl==3.2.1 pin==4.0.0``, then ``python peer_crocoddyl.py OUT.json DIR...`` with folders of plans.
 The durations of launch and flight are the plan's, with flat feet; what the plan has as limits are barriers here, and
 motors have neither a torque-speed line nor rotors. It moves a floating base with all joints of the robot, also where

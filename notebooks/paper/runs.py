@@ -75,7 +75,7 @@ def _on_ground(tape: Tape, robot: Robot, time_s: float) -> SimulationResult:
 def study(folder: str | Path, path: Path = LOG) -> None:
     """Many robots and the whole landing basin for the plan in ``folder``, in every engine, kept as one row each.
 
-    What the folder's log has is not simulated again. ``python -m paper.runs DIR`` calls it.
+    Trials in the folder's log are not simulated again. ``python -m paper.runs DIR`` calls it.
     """
     rows = []
     for engine in ENGINES:

@@ -1,8 +1,8 @@
 """Jumps in three dimensions, by the dozen: which targets are planned, and how they land.
 
 ``python -m paper.three_dimensions`` in the folder of the notebooks does what :data:`LOG` lacks, one line per target,
-and can be stopped and started again; playbacks and perturbed robots take an hour. Notebook 13 draws the file. Rows that
-tell ``attempts`` were made by the whole-body program, the others by the program before it.
+and can be stopped and started again; playbacks and perturbed robots take an hour. Notebook 13 draws the file. Rows with
+``attempts`` were made by the whole-body program, the others by the program before it.
 """
 
 from __future__ import annotations

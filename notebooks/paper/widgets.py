@@ -14,7 +14,7 @@ from typing import TypeVar
 from jumplab.io.progress import tell
 
 T = TypeVar("T")
-SESSION = "JPY_SESSION_NAME"  # set by Jupyter's server for the kernel of a notebook that somebody has opened
+SESSION = "JPY_SESSION_NAME"  # set by Jupyter's server for the kernel of a notebook that is open
 
 
 def watched() -> bool:

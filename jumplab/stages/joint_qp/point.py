@@ -8,8 +8,8 @@ the step's unknowns.
 
 Every step has its own QP, which sees no later step. So a cost with a larger weight is smaller in
 every step from the same state, but over the roll-out only while no joint is braked before its stop:
-dearer arms, say, swing on freely, meet the stop faster, and are braked harder there than if an
-earlier step had slowed them.
+arms with a larger weight, say, swing on freely, meet the stop faster, and are braked harder there
+than if an earlier step had slowed them.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def surface_of_jump(body: Body, limits: Limits, task: JumpTask) -> Surface:
 def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts) -> Surface:
     """The ground of a schedule, between its places on either height [m].
 
-    Raises :class:`InfeasibleError` if they leave no room for the edge.
+    Raises :class:`InfeasibleError` if no edge fits between them.
     """
     height, first = contacts.surface
     if height == 0:

@@ -304,8 +304,8 @@ class WholeBodyPlanner:
         return None
 
     def _check_standing(self, task: JumpTask, stance: np.ndarray | None) -> None:
-        """Refuse a robot whose motors cannot hold the posture in which it waits; of a robot that
-        five links describe the program tells.
+        """Refuse a robot whose motors cannot hold the posture in which it waits; the program itself
+        refuses robots that five links describe.
         """
         if self.robot.planar:
             return

@@ -257,9 +257,9 @@ def _balanced(
     """The motion, its base moved by some micrometres so that the ground's force is what is planned.
 
     Where all feet that carry are on their toes, in one ``line``, no ground force has a moment about
-    it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides
-    the planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. What
-    a phase moves the base by goes within the phase if it ``stays`` on the ground.
+    it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides the
+    planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. The
+    shift of the base in a phase vanishes within it if the phase ``stays`` on the ground.
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
@@ -487,8 +487,9 @@ def forces(
     """Wrenches (n, 2, 6) at the origins of the ``feet``, motor torques, and by name CoM with
     velocity (n, 3) and L about the CoM (n, 3).
 
-    What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the world's origin is shared out
-    by load among the feet that carry, by ``contacts`` (n, 2); ``feet`` as of :func:`feet_of`.
+    The part of inverse dynamics that the ``wrench`` (n, 2, 6) about the world's origin lacks is
+    shared out by load among the feet that carry, by ``contacts`` (n, 2); ``feet`` as of
+    :func:`feet_of`.
     """
     model = robot.model
     data = model.createData()

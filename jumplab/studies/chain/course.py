@@ -169,7 +169,7 @@ class Course:
         """Raise :class:`InputError` if a platform overlaps with a place (see :attr:`goals`) where
         the robot stands.
 
-        Between two places of different height both soles need room beside the edge; see
+        Between two places of different height both soles need space beside the edge; see
         :func:`platform_edge_m`.
         """
         if not any(self.platforms_m):

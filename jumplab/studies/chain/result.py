@@ -97,7 +97,7 @@ class ChainResult:
 
     @property
     def errors_m(self) -> np.ndarray:
-        """(K,) where the feet stand after each jump less where the course wants them [m]; with
+        """(K,) places of the feet after each jump less those of the course [m]; with
         sides and turns how far off they are.
         """
         return self._along(self.feet[1:, :2] - self.course.goals[: len(self.jumps), :2])
@@ -107,7 +107,7 @@ class ChainResult:
 
     @property
     def heading_errors_rad(self) -> np.ndarray:
-        """(K,) where the feet point after each jump less where the course wants them to [rad]."""
+        """(K,) headings of the feet after each jump less those of the course [rad]."""
         errors = self.feet[1:, 3] - self.course.goals[: len(self.jumps), 2]
         return np.arctan2(np.sin(errors), np.cos(errors))
 
