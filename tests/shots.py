@@ -99,7 +99,7 @@ class Command:
 
 
 def heed() -> None:
-    """Who runs the tests in the background may ignore Ctrl-C; the command does not."""
+    """Answer Ctrl-C: a shell that runs the tests in the background may ignore it; the command does not."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

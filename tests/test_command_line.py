@@ -1,4 +1,4 @@
-"""What all commands share: JSON, quiet, progress on a terminal, completion; no option is ignored without a word."""
+"""Options of all commands: JSON, quiet, progress on a terminal, completion; no option is ignored without a word."""
 
 import json
 import os

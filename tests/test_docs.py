@@ -185,7 +185,7 @@ def test_docstrings_begin_with_a_noun_or_a_verb():
         "What it is.",
         "How far.",
     ]
-    found = {short(path): riddles(ast.parse(path.read_text(encoding="utf-8"))) for path in [*MODULES, *PAPER]}
+    found = {short(path): riddles(ast.parse(path.read_text(encoding="utf-8"))) for path in [*MODULES, *PAPER, *TESTS]}
     assert not {name: docs for name, docs in found.items() if docs}
 
 

@@ -150,8 +150,8 @@ def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
 
 
 def played(folder, gain=8.0, damping=0.2):
-    """How far the base of a robot in MuJoCo is from its plan's end a second later, and its height [m]; joints have
-    their torques, and are pulled to their angles and rates."""
+    """Distance of a robot's base in MuJoCo from its plan's end a second later, and its height [m]; joints have their
+    torques, and are pulled to their angles and rates."""
     model, x = mujoco.MjModel.from_xml_path(str(folder / "robot.xml")), np.load(folder / "motion.npz")
     x, data = {key: x[key] for key in ("qpos", "qvel", "ctrl")}, mujoco.MjData(model)
     effort = model.actuator_ctrlrange[:, 1]

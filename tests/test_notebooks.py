@@ -319,9 +319,9 @@ def test_source_notebook_keeps_the_house_rules(stem):
 
 
 def imported(paths):
-    """What the notebooks import of jumplab, ``import jumplab as jl`` apart: pairs of a module and a name from it.
+    """Imports of the notebooks from jumplab, ``import jumplab as jl`` apart: pairs of a module and a name from it.
 
-    Of a room that is imported whole, the module is the room: ("jumplab.stages", "stages").
+    Of a sub-package that is imported whole, the module is the sub-package: ("jumplab.stages", "stages").
     """
     cells = [c for p in paths for c in nbformat.read(p, as_version=4).cells if c.cell_type == "code"]
     found = set()
@@ -336,7 +336,7 @@ def imported(paths):
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.stem)
 def test_a_notebook_enters_by_the_front_door(path):
-    """``import jumplab as jl``, and at most three rooms more."""
+    """``import jumplab as jl``, and at most three sub-packages more."""
     assert any("import jumplab as jl" in c.source for c in nbformat.read(path, as_version=4).cells)
     rooms = {module.split(".")[1] for module, _ in imported([path])}
     assert len(rooms) <= 3, rooms
