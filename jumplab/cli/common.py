@@ -240,7 +240,7 @@ def print_summary(summary: Mapping[str, Any]) -> None:
     if summary.get("method") == "three-step" and all(
         x["stage"][0] != "2" for x in summary["stages"]
     ):
-        print("without stage 2, which follows no flip")
+        print("without stage 2, which cannot follow a flip")
     line = "planned: distance {planned_distance_m:.3f} m, rise {planned_rise_m:.3f} m"
     if summary.get("planned_side_m") is not None:
         line += ", side {planned_side_m:.3f} m, turn {turn_deg:.1f} deg"
