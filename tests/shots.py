@@ -168,7 +168,7 @@ def faults_of_end(code: int, number: signal.Signals, said: str) -> list[str]:
 
 
 def faults_of_folders(place: Path) -> list[str]:
-    """Every result folder speaks of one and the same plan."""
+    """Every result folder is of one and the same plan."""
     faults = []
     for path in [place / name for name in ("jump", "new")]:
         if not (path / store.SUMMARY).exists():

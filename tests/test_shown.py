@@ -1,4 +1,4 @@
-"""Results show themselves: one line where they are printed, a card in a notebook, columns by the names of joints."""
+"""Results have rich displays: one line where they are printed, a card in a notebook, columns by the names of joints."""
 
 import os
 import re
