@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # what only some of the functions need is imported by them
 
 
 class Saved(NamedTuple):
-    """What a result folder holds."""
+    """Content of a result folder."""
 
     plan: JumpPlan  # results of its stages are not on file
     run: SimulationResult | None  # its simulation, if there is one
@@ -107,7 +107,7 @@ def plan(
         if not (alone and (contacts is None or like is None)):
             raise InputError(
                 "a contact schedule, or a jump like a clip, is planned by the whole-body program; "
-                "leave method, robust and starts out, and give one of both"
+                "leave method, robust and starts out, and give one of the two"
             )
         with patience(patience_s):
             made = _followed(task, robot, contacts, like, changes)
@@ -249,6 +249,6 @@ def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
 
 
 def _in_script() -> bool:
-    """Whether a file is run as a program, so that nobody sees what an expression returns."""
+    """Whether Python runs a file as a program: then the value of an expression is not displayed."""
     main = sys.modules.get("__main__")
     return main.__spec__ is None and hasattr(main, "__file__") and "get_ipython" not in vars(main)

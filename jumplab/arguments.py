@@ -1,8 +1,8 @@
-"""What public functions take: one conversion of arguments, by their annotations.
+"""Conversion of the arguments of public functions, in one way, by their annotations.
 
 Real numbers are those of Python and NumPy, and finite ones where nothing else is said; truth
-values, complex numbers and texts are none. What does not fit is refused (:class:`InputError`) in
-one sentence, before anything is done with it.
+values, complex numbers and texts are none. Other values are refused (:class:`InputError`) in one
+sentence, before anything is done with them.
 """
 
 from __future__ import annotations

@@ -125,9 +125,7 @@ class Shown:
     pictures: ClassVar[Callable[[], Any]]
 
     def line(self) -> str:
-        """What there is to say of it, without line breaks; by default its plain values, and the
-        names of the rest.
-        """
+        """Summary in one line; by default its plain values, and the names of the rest."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         plain = [
             f"{k}={x!r}"

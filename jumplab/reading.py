@@ -1,4 +1,4 @@
-"""The one way to read a file that somebody else may have made, with its limits.
+"""The one way to read a file that others may have made, with its limits.
 
 Only regular files are read (no device, pipe or folder, which may never end), none that is larger
 than :data:`KINDS` allows, and nothing is unpacked or allocated before its header says that it
@@ -120,7 +120,7 @@ def check_mjcf(
     """Refuse (``error``) an MJCF file that makes more copies or points than a robot has, or
     includes what is no file of it; ``folder`` is that of the first file, ``seen`` are those before.
 
-    MuJoCo itself has no such limits. What is no XML is left to it.
+    MuJoCo itself has no such limits. Files that are no XML are left to it.
     """
     try:
         todo = [(xml(content(path, "robot", error=error), path.name, error), 1)]

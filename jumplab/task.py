@@ -1,4 +1,4 @@
-"""What the jump shall achieve, and what ballistics alone says about it (Sec. III of the paper)."""
+"""Target of a jump, and ballistic consequences of it alone (Sec. III of the paper)."""
 
 from __future__ import annotations
 

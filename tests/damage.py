@@ -53,7 +53,7 @@ OPTIONS = {
 
 
 def forked(work: Callable[[], Row], folder: Path, longest_s: int = LONGEST_S) -> Row:
-    """What ``work`` returns in a process of its own; one that dies of its time is "long", of anything else "dead"."""
+    """Result of ``work`` in a process of its own; one that dies of its time is "long", of anything else "dead"."""
     reading, writing = os.pipe()
     child = os.fork()
     if not child:

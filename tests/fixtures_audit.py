@@ -1,4 +1,4 @@
-"""What the tests of the audit share: a good plan, and tools that break a tape (or robot) in just one way."""
+"""Fixtures of the audit's tests: a good plan, and tools that break a tape (or robot) in just one way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of the core share: jumps planned once per session, tapes looked at again, planar motions."""
+"""Fixtures of the core's tests: jumps planned once per session, tapes looked at again, planar motions."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -178,7 +178,7 @@ def replay(distance_m: float, height_m: float, platform_m: float = 0.0, method: 
 
 
 def import_graph():
-    """Who imports whom in the package; a room that loads its modules lazily counts as importing all of them."""
+    """Imports within the package; a sub-package that loads its modules lazily counts as importing all of them."""
     graph = grimp.build_graph("jumplab", cache_dir=None)
     for room in [m for m in graph.modules if m.count(".") == 1]:
         below = graph.find_children(room)

@@ -99,7 +99,7 @@ class Command:
 
 
 def heed() -> None:
-    """Who runs the tests in the background may ignore Ctrl-C; the command does not."""
+    """Answer Ctrl-C: a shell that runs the tests in the background may ignore it; the command does not."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -168,7 +168,7 @@ def faults_of_end(code: int, number: signal.Signals, said: str) -> list[str]:
 
 
 def faults_of_folders(place: Path) -> list[str]:
-    """Every result folder speaks of one and the same plan."""
+    """Every result folder is of one and the same plan."""
     faults = []
     for path in [place / name for name in ("jump", "new")]:
         if not (path / store.SUMMARY).exists():

@@ -1,4 +1,4 @@
-"""What a refusal says to ask for instead has a plan, whoever refuses and whatever was asked.
+"""Advice of refusals: the easier target has a plan, whoever refuses and whatever was asked.
 
 JUMPLAB_REFUSALS=60 sets how many advices are followed; the everyday run makes do with a few.
 """

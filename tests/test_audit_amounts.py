@@ -59,7 +59,7 @@ def random_tape(seed: int) -> Tape:
 
 
 class Truth:
-    """What a tape says, worked out without the audit; ``said`` is check -> (value, time, label)."""
+    """Values of a tape, worked out without the audit; ``said`` is check -> (value, time, label)."""
 
     def __init__(self, tape: Tape, task: JumpTask | None):
         self.tape, self.task, self.said = tape, task, {}

@@ -1,4 +1,4 @@
-"""What the audit says, word for word, and where its limits begin: on tapes of random numbers, a few ms each."""
+"""Words of the audit, and the places where its limits begin: on tapes of random numbers, a few ms each."""
 
 from __future__ import annotations
 

@@ -76,12 +76,12 @@ def pages(site: Path) -> list[Path]:
 
 @functools.cache
 def names(page: Path) -> frozenset[str]:
-    """What links into a page may name."""
+    """Names in a page to which links may lead."""
     return frozenset(re.findall(r'\bid="([^"]+)"', page.read_text(encoding="utf-8")))
 
 
 def dead(link: str, site: Path) -> str | None:
-    """Why a link within the site leads nowhere."""
+    """Fault of a link within the site, in words; None if it leads somewhere."""
     address, name = urldefrag(link)
     if urlparse(address).scheme != "file":
         return None
@@ -101,7 +101,7 @@ def test_first_page_leads_to_the_book(site):
 
 
 def faults_of(tab, page: Path, site: Path, width: int) -> list[str]:
-    """What is wrong with one page in a tab of that width."""
+    """Faults of one page in a tab of that width."""
     said = []
     tab.set_default_timeout(PATIENCE_MS)
     tab.on("pageerror", lambda e: said.append(str(e)))

@@ -1,4 +1,4 @@
-"""What no motion exceeds: the bounds hold for point masses at their best, for postures and for plans at hand."""
+"""Bounds for every motion: they hold for point masses at their best, for postures and for plans at hand."""
 
 import numpy as np
 import pinocchio as pin

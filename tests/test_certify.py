@@ -164,7 +164,7 @@ def test_interrupted_it_goes_on(folder, physics, capsys):
 
     physics.say = stop
     assert cli.main(["certify", str(folder), "--n", "2", "--jobs", "1"]) == 130
-    assert "finished trials are kept, and the same command goes on from there" in capsys.readouterr().err
+    assert "finished trials are kept, and the same command resumes from there" in capsys.readouterr().err
     assert held(folder) == LAID | {"trials.jsonl"}
     physics.say, physics.calls = real, []
     assert certify(folder, 2, jobs=1).resumed == 5 and len(physics.calls) == 9

@@ -1,4 +1,4 @@
-"""What all commands share: JSON, quiet, progress on a terminal, completion; no option is ignored without a word."""
+"""Options of all commands: JSON, quiet, progress on a terminal, completion; no option is ignored without a word."""
 
 import json
 import os
@@ -65,14 +65,14 @@ def test_quiet_says_nothing(capsys, planned):
 
 
 IGNORED = [
-    ("view {} --movie a.gif --out b.html", "--out names the page, and --movie is given instead of it; leave it away"),
-    ("chain --distance-m 0.5 --jobs 2 --out x", "--jobs is for several --runs; leave it away"),
+    ("view {} --movie a.gif --out b.html", "--out names the page, and --movie is given instead of it; leave it out"),
+    ("chain --distance-m 0.5 --jobs 2 --out x", "--jobs is for several --runs; leave it out"),
     ("chain --distance-m 0.5 --ranges wide --out x", "--ranges says how perturbed robots differ, and neither --seed "
-     "nor --runs asks for one; leave it away"),
+     "nor --runs asks for one; leave it out"),
     ("sweep --out x --cluster tcp://a:1 --jobs 2", "--jobs is for processes of this machine, and --cluster does the "
-     "work elsewhere; leave it away"),
+     "work elsewhere; leave it out"),
     ("robot check g1 --repair inertia", "--repair is for a bare URDF; a configuration has its own [source] repair, "
-     "so leave it away"),
+     "so leave it out"),
 ]  # fmt: skip
 
 

@@ -31,7 +31,7 @@ def schedule(words: str, places: int = 0, **how) -> Contacts:
 
 
 def reached(contacts: Contacts) -> list[float]:
-    """How far ahead the places are [m]."""
+    """Places ahead [m]."""
     return [p.ahead_m for p in contacts.places]
 
 
@@ -141,7 +141,7 @@ def test_a_standing_jump_ends_in_flight():
 
 # as a problem -------------------------------------------------------------------------------------
 def test_phases_share_what_does_not_jump(bhr):
-    """Where a foot lands, forces and accelerations jump; the rows of what is shared stand only once."""
+    """Forces and accelerations jump at a landing; the rows of shared quantities stand only once."""
     limits, weights = Limits(), Weights()
     phases = Schedule(Body(bhr), Contacts.leap(bhr), limits, weights).problem().phases
     assert [p.shared for p in phases] == ["", "qvaz", "qv", "qvaz", "qvaz", "qvaz", "qv", "qv"]

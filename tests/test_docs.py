@@ -21,6 +21,7 @@ from jumplab.task import FRICTION
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").glob("*.py"))
+PAPER = sorted((ROOT / "notebooks" / "paper").glob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BOOK = ROOT / "notebooks" / "book"
@@ -172,6 +173,22 @@ def test_these_checks_can_fail():
     assert unhinted(tree) == ["A.f", "g"] and not unhinted(ast.parse("def f(x: int, *, y: str = '') -> None: ..."))
 
 
+def riddles(tree):
+    """Docstrings, of private names too, that begin with a question word instead of a noun or a verb."""
+    nodes = (node for node in ast.walk(tree) if isinstance(node, FUNCTIONS | ast.ClassDef | ast.Module))
+    docs = (ast.get_docstring(node) or "" for node in nodes)
+    return [doc.partition("\n")[0] for doc in docs if re.match(r"(?:What|How|Where|Who|Whose|Why)\b", doc)]
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb():
+    assert riddles(ast.parse('"""What it is."""\nclass A:\n    """Whether."""\n    def _f():\n        "How far."')) == [
+        "What it is.",
+        "How far.",
+    ]
+    found = {short(path): riddles(ast.parse(path.read_text(encoding="utf-8"))) for path in [*MODULES, *PAPER, *TESTS]}
+    assert not {name: docs for name, docs in found.items() if docs}
+
+
 def torn(doc):
     """Lines of a docstring's lists of parameters and attributes that the reference would take for one."""
     lines, inside = doc.splitlines(), ""
@@ -224,7 +241,7 @@ CLEAN = r"\bclean(?:ly|er|est)?\b"  # in prose: a plan passes the audit, ground 
 
 
 def prose():
-    """(where, text) of all that users read: notebooks with their captions and messages, README, book, help."""
+    """(where, text) of all that people read: notebooks with captions and messages, README, book, help, docstrings."""
     for path in NOTEBOOKS:
         for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
             source = "".join(cell["source"])
@@ -240,6 +257,10 @@ def prose():
     yield "options.toml", (ROOT / "jumplab" / "cli" / "options.toml").read_text(encoding="utf-8")
     for path in MODULES:
         yield from ((short(path), text) for text in texts_of(path.read_text(encoding="utf-8"), sentences=True))
+    for path in (*MODULES, *PAPER):
+        nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        docs = (ast.get_docstring(node) for node in nodes if isinstance(node, FUNCTIONS | ast.ClassDef | ast.Module))
+        yield from ((short(path), re.sub(r"^(?:>>>|\.\.\.) .*$", "", doc, flags=re.M)) for doc in docs if doc)
 
 
 def texts_of(source, *, sentences=False):

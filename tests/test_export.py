@@ -70,7 +70,7 @@ def npz(path) -> dict:
 
 
 def states(format_name: str, path) -> dict:
-    """What a format says, under MuJoCo's names where it has them: qpos (F, 7 + J), qvel, and all of its own."""
+    """Content of a format, under MuJoCo's names where it has them: qpos (F, 7 + J), qvel, and all of its own."""
     if format_name == "unitree-csv":
         rows = np.loadtxt(path, delimiter=",")
         return {"qpos": rows[:, [0, 1, 2, 6, 3, 4, 5, *range(7, rows.shape[1])]]}

@@ -283,7 +283,7 @@ def test_between_samples():
     for outside in ([0.4999, 0.51], [0.51, 0.5205 + 2e-9]):
         first, last = (f"{x:g}" for x in outside)
         assert refused(lambda times=outside: motion.at(times)) == (
-            f"times {first} ... {last} s leave the motion, 0.5 ... 0.5205 s"
+            f"times {first} ... {last} s are outside the motion, 0.5 ... 0.5205 s"
         )
 
 

@@ -72,7 +72,7 @@ def test_start_turns_as_asked_and_goes_where_it_should(turns):
 
 
 def test_a_jump_keeps_its_own_limits():
-    """What flips need is a copy: jumps without rotation have another planner and the settings of before."""
+    """Settings of flips are a copy: jumps without rotation have another planner and the settings of before."""
     assert Limits().capture_moment is None and Limits().least_push == 0
     assert Limits().touchdown_ankle_stroke is None
     assert Limits().touchdown_trunk_rate == 1.0 and Limits().of_flip().touchdown_trunk_rate == 5.0

@@ -212,7 +212,7 @@ def source(path: Path):
 
 
 def injected(rng, folder):
-    """What papermill would do: add a cell after the parameters, then run up to the cell that checks them."""
+    """Run a notebook as papermill would: add a cell after the parameters, then run up to the cell that checks them."""
     path = rng.choice(SOURCES)
     own = {"01": ("samples", [0, -5, 1.5, "200", True, 10**7]), "02": ("grid", [0, 1, "6", 6.0, None, 999]),
            "03": ("targets", [0, 201, "6", None, 2.5]), "04": ("targets", [0, 201, "6", None, 2.5]),
@@ -272,7 +272,7 @@ def refuse(doors, count, seed, folder, monkeypatch, capfd):
 
 
 def tracked() -> list[str]:
-    """What stands in the checkout itself, where a run without --out would write."""
+    """Content of the checkout itself, where a run without --out would write."""
     return sorted(p.name for p in ROOT.iterdir() if p.name != ".pytest_cache")
 
 

@@ -47,7 +47,7 @@ def test_commands_can_be_typed(title, monkeypatch):
 
 @pytest.fixture
 def names(tmp_path, monkeypatch):
-    """What the page's first lines define, with a plan that tests share."""
+    """Names that the page's first lines define, with a plan that tests share."""
     monkeypatch.chdir(tmp_path)
     (start,) = blocks(PREAMBLE, "python")
     imports, _, last = start.rstrip().rpartition("\n")

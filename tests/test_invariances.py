@@ -1,4 +1,5 @@
-"""What must not change, or change in a known way: worlds moved, turned, mirrored and scaled, flights run backwards.
+"""Quantities that must not change, or change in a known way: worlds moved, turned, mirrored and scaled, flights run
+backwards.
 
 Drawn by hypothesis, the same cases in every run. Tapes of random numbers obey these laws as well as good ones do.
 """
@@ -175,7 +176,7 @@ def test_the_world_moved(seed, x, y):
 @FEW
 @given(SEEDS, st.floats(-3.1, 3.1))
 def test_the_world_turned(seed, yaw):
-    """Where a platform begins is counted along x, and a tilt to the left from the x-z plane; nothing else is."""
+    """The edge of a platform is counted along x, and a tilt to the left from the x-z plane; nothing else is."""
     place = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3))
     found = audit(placed(random_tape(seed), place), ROBOT)
     same(found, judged(seed), but=ALONG_X)

@@ -35,7 +35,7 @@ def errors(plan, target=(1.0, 0.5)):
 
 
 def check_physics(plan):
-    """What must hold whatever the reference: contacts, limits, symmetry, dynamics."""
+    """Check laws that hold whatever the reference: contacts, limits, symmetry, dynamics."""
     r = joint_violations(plan, Robot.load())
     assert r["toe_drift"] < 1e-3 and r["penetration"] < 1e-3
     assert r["asymmetry"] < 1e-9

@@ -135,7 +135,7 @@ def test_a_pickle_of_a_motion_library_is_read(tmp_path):
 
 
 class Code:
-    """What a pickle may run."""
+    """Code that a pickle may run."""
 
     def __reduce__(self):
         return os.mkdir, ("it_ran",)

@@ -28,7 +28,7 @@ def test_no_module_imports_itself_by_way_of_others(imports):
 
 
 def test_rooms_are_few_and_their_chains_short(imports):
-    """A room is a folder at the top of the package; the files beside them are the front door."""
+    """A sub-package is a folder at the top of the package; the files beside them are the front door."""
     rooms = {name: set() for name in {module.split(".")[1] for module in imports if module.count(".") > 1}}
     for module, others in imports.items():
         for other in others:

@@ -110,7 +110,7 @@ def test_what_no_clip_shows_is_refused():
         jl.plan(jl.JumpTask(0.5, 0.3, platform_m=0.1), "g1", like=CLIPS / "jump_forward_level2.pkl")
     with pytest.raises(InputError, match="its feet carry as LR R r - L LR; a jump to a target is like one"):
         jl.plan(GOAL, "g1", like=CLIPS / "side_jump_level2.pkl")
-    with pytest.raises(InputError, match="leave method, robust and starts out, and give one of both"):
+    with pytest.raises(InputError, match="leave method, robust and starts out, and give one of the two"):
         jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl", method="three-step")
 
 
@@ -150,8 +150,8 @@ def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
 
 
 def played(folder, gain=8.0, damping=0.2):
-    """How far the base of a robot in MuJoCo is from its plan's end a second later, and its height [m]; joints have
-    their torques, and are pulled to their angles and rates."""
+    """Distance of a robot's base in MuJoCo from its plan's end a second later, and its height [m]; joints have their
+    torques, and are pulled to their angles and rates."""
     model, x = mujoco.MjModel.from_xml_path(str(folder / "robot.xml")), np.load(folder / "motion.npz")
     x, data = {key: x[key] for key in ("qpos", "qvel", "ctrl")}, mujoco.MjData(model)
     effort = model.actuator_ctrlrange[:, 1]

@@ -231,7 +231,7 @@ def test_the_audit_misses_what_a_tape_leaves_out(heavy, plan, key):
 
 
 def test_energy_counts_rotors_and_losses(bhr, heavy, plan):
-    """What motors put in is in links and rotors, or lost: without either, the balance is off by as much."""
+    """Energy of motors is in links and rotors, or lost: without either, the balance is off by as much."""
 
     def found(robot):
         return {c.name: c.value for c in audit(plan.tape, robot, plan.task).checks}["energy balance"]

@@ -86,7 +86,9 @@ def test_chain_in_an_odd_place_under_this_very_python(odd_folder, monkeypatch):
 
 
 def test_figures_that_look_the_same_stay(tmp_path):
-    """A picture is replaced, with its PDF and caption, where it shows; other files and damaged pictures always."""
+    """A picture is replaced, with its PDF and caption, where it shows; a caption alone where its words changed, not
+    just the versions in its last line; other files and damaged pictures always.
+    """
     work, out, figures = (tmp_path / name for name in ("work", "out", "figures"))
     for folder in (work / "figures", work / "result", out, figures):
         folder.mkdir(parents=True)
@@ -97,11 +99,14 @@ def test_figures_that_look_the_same_stay(tmp_path):
         Image.fromarray(old).save(figures / f"{name}.png")
         Image.fromarray(new).save(work / "figures" / f"{name}.png")
     for folder, text in ((figures, "old"), (work / "figures", "new")):
-        for name in ("same.txt", "faint.pdf", "other.txt", "damaged.png", "alone.txt"):
+        for name in ("faint.pdf", "other.txt", "damaged.png", "alone.txt"):
             (folder / name).write_text(text)
+        (folder / "faint.txt").write_text(f"A caption, {text}.\nMade with a package.\n")
+        (folder / "same.txt").write_text(f"A caption.\nMade with a package, {text}.\n")
     notebooks.publish(work, out, figures)
-    texts = {name: (figures / name).read_text() for name in ("same.txt", "faint.pdf", "other.txt", "alone.txt")}
-    assert texts == {"same.txt": "old", "faint.pdf": "old", "other.txt": "new", "alone.txt": "new"}
+    texts = {path.name: path.read_text() for path in figures.iterdir() if path.suffix in (".txt", ".pdf")}
+    assert texts.pop("same.txt").endswith("old.\n") and texts.pop("faint.txt").startswith("A caption, new.")
+    assert texts == {"faint.pdf": "old", "other.txt": "new", "alone.txt": "new"}
     assert np.asarray(Image.open(figures / "other.png"))[0].max() == 0
     assert (figures / "damaged.png").read_text() == "new"
 
@@ -212,7 +217,7 @@ def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
     path.unlink()
     monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", tmp_path)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=r"^no notebooks in '.*notebooks' nor in '.*notebooks'; install jumplab anew$"):
+    with pytest.raises(InputError, match=r"^no notebooks in '.*notebooks' nor in '.*'; install jumplab again$"):
         notebooks.find_notebooks()
 
 
@@ -314,9 +319,9 @@ def test_source_notebook_keeps_the_house_rules(stem):
 
 
 def imported(paths):
-    """What the notebooks import of jumplab, ``import jumplab as jl`` apart: pairs of a module and a name from it.
+    """Imports of the notebooks from jumplab, ``import jumplab as jl`` apart: pairs of a module and a name from it.
 
-    Of a room that is imported whole, the module is the room: ("jumplab.stages", "stages").
+    Of a sub-package that is imported whole, the module is the sub-package: ("jumplab.stages", "stages").
     """
     cells = [c for p in paths for c in nbformat.read(p, as_version=4).cells if c.cell_type == "code"]
     found = set()
@@ -331,7 +336,7 @@ def imported(paths):
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.stem)
 def test_a_notebook_enters_by_the_front_door(path):
-    """``import jumplab as jl``, and at most three rooms more."""
+    """``import jumplab as jl``, and at most three sub-packages more."""
     assert any("import jumplab as jl" in c.source for c in nbformat.read(path, as_version=4).cells)
     rooms = {module.split(".")[1] for module, _ in imported([path])}
     assert len(rooms) <= 3, rooms

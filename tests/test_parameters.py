@@ -1,4 +1,4 @@
-"""What a notebook's first cells refuse, and what they let pass."""
+"""Parameters that a notebook's first cells refuse, and those that they accept."""
 
 import pytest
 
@@ -31,7 +31,7 @@ def test_check_parameters_refuses(injected, sentence):
 
 
 def opened(injected, declared=DECLARED):
-    """What a notebook's cells know after its parameters and papermill's own cell."""
+    """Names of a notebook's cells after its parameters and papermill's own cell."""
     namespace = {"In": ["", declared, f"# Parameters\n{injected}\n"]}
     exec("\n".join(namespace["In"]), namespace)
     return namespace

@@ -120,7 +120,7 @@ def test_unknown_method(method):
 
 
 def failing(error: Exception):
-    """What raises it, whatever it is asked for."""
+    """An object that raises the error, whatever it is asked for."""
 
     def fail(*arguments, **options):
         raise error

@@ -3,7 +3,6 @@
 import json
 import re
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -153,14 +152,18 @@ def test_no_jumper_and_why(name, repair, words):
 
 
 # robots that are downloaded one by one -----------------------------------------------------------------------------
-@pytest.fixture(params=DOWNLOADED)
-def downloaded(request) -> tuple[str, Robot]:
+def fetched(name: str) -> Robot:
     pytest.importorskip("robot_descriptions")
     try:
-        return request.param, Robot.load(request.param)
+        return Robot.load(name)
     except RobotError as e:
         assert "cannot fetch it" in str(e)
         pytest.skip(str(e))
+
+
+@pytest.fixture(params=DOWNLOADED)
+def downloaded(request) -> tuple[str, Robot]:
+    return request.param, fetched(request.param)
 
 
 @pytest.mark.slow
@@ -173,9 +176,7 @@ def test_a_downloaded_robot_is_what_its_configuration_says(downloaded):
 @pytest.mark.parametrize("engine", INSTALLED)
 def test_legs_whose_axes_coincide_are_led_by_their_angles(name, engine):
     """Without roll at the ankle, or with yaw and roll about one axis where the thigh is level."""
-    if name not in DOWNLOADED or not find_spec("robot_descriptions"):
-        pytest.skip("robot_descriptions is not installed")
-    robot = Robot.load(name)
+    robot = fetched(name)
     plan = Planner(robot).plan(JumpTask(0.3, 0.15))
     m = simulate_jump(plan.tape, robot, engine=engine).metrics
     assert m.foot_distance_m == pytest.approx(0.3, abs=0.005) and m.com_rise_m == pytest.approx(0.15, abs=0.003)

@@ -52,7 +52,7 @@ def test_sagittal_model_is_the_full_robot(tmp_path, variant):
 
 
 def test_canted_hips_leave_the_plane(tmp_path):
-    """What five links miss grows by the square of the angle, and is seen."""
+    """The error of five links grows by the square of the angle, and is seen."""
     robots = [load(tmp_path, canted, angle_rad) for angle_rad in (0.01, 0.04, 0.3)]
     small, large, _ = (reduction_error(robot)[1] for robot in robots)
     assert 1e-6 < small < 1e-4 < large < 1e-3 and large == pytest.approx(16 * small, rel=0.1)

@@ -1,4 +1,4 @@
-"""What the default robot reaches: sampled postures and the envelope made of them."""
+"""Reach of the default robot: sampled postures and the envelope made of them."""
 
 import numpy as np
 import pinocchio as pin

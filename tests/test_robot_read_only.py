@@ -107,7 +107,7 @@ print(json.dumps([robot.hash, plan.tape.q.sum().hex(), plan.tape.tau.max().hex()
 
 @pytest.mark.slow
 def test_a_fresh_process_after_a_change_plans_as_if_there_had_been_none(bhr, tmp_path):
-    """What is kept between processes is another robot's under another name."""
+    """Files that are kept between processes belong to another robot under another name."""
 
     def said(which: str) -> list:
         environment = os.environ | {"JUMPLAB_CACHE": str(tmp_path / "cache")}

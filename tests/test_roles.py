@@ -170,7 +170,7 @@ def test_joints_without_stops_get_a_range_that_is_told(tmp_path):
 
 
 def test_hips_that_are_coupled_are_held(tmp_path):
-    """Where the right hip yaw follows the left one, neither can move alone."""
+    """A right hip yaw that follows the left one is held, and so is the left one."""
     robot = root()
     ET.SubElement(joint(robot, "right_hip_yaw"), "mimic", joint="left_hip_yaw")
     path, found = drafted(robot, tmp_path)

@@ -28,7 +28,7 @@ def follows(p):
 
 
 def running(skip: int = 0) -> tuple[Term, ...]:
-    """What holds all along; at a first node that is shared the phase before says so."""
+    """Terms that hold all along; at a first node that is shared the phase before has them."""
     return (
         Term("jerk", "-", "m/s^3", "mid", lambda p: p.j[0], weight=1.0),
         Term("acceleration", "-", "m/s^2", "node", lambda p: p.a, weight=20.0),

@@ -1,4 +1,4 @@
-"""Results show themselves: one line where they are printed, a card in a notebook, columns by the names of joints."""
+"""Results have rich displays: one line where they are printed, a card in a notebook, columns by the names of joints."""
 
 import os
 import re
@@ -85,6 +85,8 @@ def test_columns_have_names(plan):
     np.testing.assert_array_equal(plan.torque["left_knee"], plan.tape.tau[:, names.index("left_knee")])
     both = np.column_stack([plan.speed["left_hip_pitch"], plan.speed["right_hip_pitch"]])
     np.testing.assert_array_equal(plan.speed["hip"], both)
+    np.testing.assert_array_equal(plan.torque["left_ankle"], plan.torque["left_ankle_pitch"])  # one side of a role
+    np.testing.assert_array_equal(plan.torque["right_knee"], plan.torque["knee"][:, 1])
     assert plan.angle["knee"].shape == (len(plan.t), 2) and "nose" not in plan.angle and "knee" in plan.angle
     with pytest.raises(InputError, match=r"^there is no joint 'nose'; there are hip_pitch, knee, ankle_pitch, "):
         plan.torque["nose"]

@@ -133,7 +133,7 @@ CHEATS = {
 
 @pytest.mark.parametrize("name", CHEATS)
 def test_a_cheat_is_caught(bhr, tape, monkeypatch, name, capsys):
-    """What is found besides is named only where it is all."""
+    """A set names all findings of a cheat; a name alone may have others beside it."""
     engine, cheat, steps, caught = CHEATS[name]
     real, count = engine.step, iter(ALWAYS)
 

@@ -56,7 +56,7 @@ def test_an_error_at_the_start_is_led_back_with_its_own_derivatives(bhr, tape):
 
 
 def test_a_wrong_posture_moves_what_is_followed(bhr, tape):
-    """Where it begins the robot is on its way already; when the heels rise it is the plan's."""
+    """The path to follow begins where the robot is; when the heels rise it is the plan's."""
     plain, led = (LaunchFeedback(bhr, tape, Playback(tape, bhr)) for _ in range(2))
     q = wrong_start(bhr, tape)
     led.begin(q)
@@ -100,7 +100,7 @@ def test_feet_tell_where_the_com_is(bhr, tape, place_m):
 
 
 def pitch_at_takeoff(run, tape):
-    """How far the trunk is turned about the pitch axis beyond the plan, just after take-off [rad]."""
+    """Turn of the trunk about the pitch axis beyond the plan, just after take-off [rad]."""
     row = round(tape.takeoff_time / STEP_S)
     planned = tape.q[np.searchsorted(tape.t, tape.takeoff_time), 3:7]
     turn = pin.Quaternion(run.q[row, 3:7]).matrix() @ pin.Quaternion(planned).matrix().T

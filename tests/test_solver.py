@@ -231,7 +231,7 @@ def test_infeasible_names_the_terms_in_conflict():
 
 
 def test_infeasible_in_physical_units():
-    """What is said is in the term's unit, whatever its scale: at 1 m/s^2, a quarter of the way is the most there is."""
+    """Violations are in the term's unit, whatever its scale: at 1 m/s^2, a quarter of the way is the most there is."""
     said = set()
     for scale in (0.1, 1.0, 20.0):
         term = Term("push", "-", "N", "node", lambda p: 10 * p.a, lower=-10.0, upper=10.0, scale=scale)

@@ -438,7 +438,7 @@ STARTS = [("ramp", True), ("schedule", True), ("schedule", False), ("stance", Fa
 @pytest.mark.parametrize("read", [True, False])
 @pytest.mark.parametrize("near", [True, False])
 def test_all_starts_are_tried_and_a_refusal_is_explained_to_who_reads_it(near, read, request):
-    """Who does not is refused sooner."""
+    """Without a reader of the reason, the refusal comes sooner."""
     known = jump(SIDE).whole_body if near else None
     last, tried = request.getfixturevalue("refusing")
     token = EXPLAINED.set(read)

@@ -348,7 +348,7 @@ class Seen:
         return {f"{name} foot {k}": np.array(x)[rows] for k, x in zip(words, levels, strict=True)}
 
     def swinging(self, side: int) -> list[float]:
-        """How high a sole in the air is above what is asked for, and its ankle above where it stands."""
+        """Height of a sole in the air above the wanted one, and of its ankle above its place."""
         foot = self.robot.foot
         if self.plane:
             length = foot.toe - foot.heel
@@ -418,7 +418,7 @@ class Seen:
         return off[[0] if self.plane else [0, 1]]
 
     def tracking(self) -> dict:
-        """How far the motion is from stage 1's."""
+        """Differences of the motion from stage 1's."""
         rows = {"track inertia": self.rho - self.ref["rho"], "track inertia rate": self.rho_rate - self.ref["rho_rate"]}
         if not self.modes:
             return rows | {"ankle rate": self.sagittal(self.rates)[2]}

@@ -420,7 +420,7 @@ def test_killed_in_parallel_and_resumed_equals_serial(folder, tmp_path):
         said = process.communicate(timeout=60)[1]
         if number == signal.SIGINT and process.returncode:
             assert process.returncode == 130
-            assert said == "jumplab: interrupted; finished trials are kept, and the same command goes on from there\n"
+            assert said == "jumplab: interrupted; finished trials are kept, and the same command resumes from there\n"
     process = start(["-c", LANDED], "trials", other, "--n", str(n), "--jobs", "2")
     told = process.communicate()[0]
     assert 1 <= int(re.search(r"(\d+) trials from an earlier run", told)[1]) and content(other) == content(folder)

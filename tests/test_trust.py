@@ -141,7 +141,7 @@ def test_hostile_files_are_refused_in_little_memory_and_time(bhr, tmp_path):
 
 @pytest.mark.parametrize("name", [".commit", ".staging", "plan.npz", "trials.jsonl", "falls"])
 def test_no_link_below_a_result_folder_is_followed(bhr, tmp_path, name):
-    """What it leads to stays as it was, whoever reads or writes the folder."""
+    """Targets of links stay as they were, whoever reads or writes the folder."""
     place = plan_folder(tmp_path / "out", bhr)
     foreign = tmp_path / "foreign"
     if "." in name[1:]:
@@ -215,7 +215,7 @@ def test_processes_and_threads_do_everything_at_once(tmp_path, monkeypatch):
 
 # processes ----------------------------------------------------------------------------------------------------------
 def ended(work, **limits):
-    """How a fork that does ``work`` within limits, such as CPU=30, has ended: its exit code, or minus a signal."""
+    """End of a fork that does ``work`` within limits, such as CPU=30: its exit code, or minus a signal."""
     child = os.fork()
     if not child:
         code = 99

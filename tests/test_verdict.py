@@ -1,4 +1,4 @@
-"""Where there is no plan: the programs say so, in words; arms and trunk add to what the legs' push gives."""
+"""Verdicts where there is no plan: the programs say so, in words; arms and trunk add to the rise of the legs' push."""
 
 import math
 

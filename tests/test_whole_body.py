@@ -203,7 +203,7 @@ class Taken(Exception):
 
 
 def asked(monkeypatch, stage, *target):
-    """What a solve is asked for: parameters, guess, references and so on, by name."""
+    """Request to a solve: parameters, guess, references and so on, by name."""
     seen = {}
 
     def solve(self, parameters, guess, **how):
@@ -260,7 +260,7 @@ def test_a_start_keeps_its_place(bhr, target):
 
 @pytest.fixture(scope="module")
 def refusal(bhr):
-    """Why a robot with a fifth of the torque cannot jump."""
+    """Refusal of a robot with a fifth of the torque, which cannot jump."""
     urdf = bhr.urdf
     for effort in ("200", "210", "150"):
         urdf = urdf.replace(f'effort="{effort}"', f'effort="{float(effort) * 0.2:g}"')

@@ -1,4 +1,4 @@
-"""How far jumplab can be trusted, in numbers: drawn wrong calls, damaged folders, signals, kills, threads.
+"""Trust in jumplab, in numbers: drawn wrong calls, damaged folders, signals, kills, threads.
 
 ``python tests/trust.py KIND DIR [N]`` does the first N cases of a kind (one of :data:`KINDS`, with its usual N), keeps
 each in DIR/KIND.jsonl, goes on there after a stop, and prints the counts and every fault. No part of the collected

@@ -64,7 +64,7 @@ class ClipReport(AuditReport):
         return [(a, b) for feet, a, b in self.phases if feet == "-"]
 
     def row(self) -> dict[str, Any]:
-        """What a table of many clips says of this one."""
+        """Row of this clip in a table of many."""
         flown = ", ".join(f"{a:.2f} to {b:.2f}" for a, b in self.flights)
         row = {"clip": self.clip.name, "physical": self.passed, "flights [s]": flown or "none"}
         return row | {f"{c.name} [{c.unit}]": c.value for c in self.checks}
@@ -184,7 +184,7 @@ def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     A foot stands where its sole is slow, and not far above the lowest one around: so far its height
     is that of the ground, and linear between. In the air it is while it is
     ``METHOD.lifted_m`` higher than that, or fast while the other one stands, or faster than any
-    foot slides. What is shorter than ``METHOD.short_s`` is passed over.
+    foot slides. Phases shorter than ``METHOD.short_s`` are ignored.
     """
     from scipy.ndimage import gaussian_filter1d, minimum_filter1d  # slow to import
 
@@ -197,7 +197,7 @@ def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     for column in still.T:
         _drop(column, False, least + 1)
         _drop(column, True, least + 1)
-    still |= ~still.any(axis=0)  # a foot that never rests tells no ground
+    still |= ~still.any(axis=0)  # a foot that never rests does not show where the ground is
     rows = np.arange(len(height))
     level = np.column_stack(
         [np.interp(rows, rows[s], h[s]) for s, h in zip(still.T, height.T, strict=True)]

@@ -14,7 +14,7 @@ from jumplab.auditing.report import LIMITS, METHOD, Measure
 
 
 def places(r: Replay) -> Iterator[Measure]:
-    """Where the soles are: slip, turn, heights over ground and platform."""
+    """Places of the soles: slip, turn, heights over ground and platform."""
     t = r.tape.t
     feet = r.tape.contact_frames
     points = r.sole_points
@@ -52,7 +52,7 @@ def pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pressure(r: Replay) -> Iterator[Measure]:
-    """How the soles press: CoP, friction, and that the ground never pulls."""
+    """Pressure under the soles: CoP, friction, and that the ground never pulls."""
     t = r.tape.t
     feet = r.tape.contact_frames
     friction = LIMITS["friction used"].limit

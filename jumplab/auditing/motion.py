@@ -137,8 +137,8 @@ def target(r: Replay) -> Iterator[Measure]:
 
 
 def capture(r: Replay) -> Iterator[Measure]:
-    """How far outside the soles a jump's capture point lies at touchdown, as a share of the CoM's
-    height over them.
+    """Distance of a jump's capture point from the soles at touchdown, as a share of the CoM's
+    height over them; 0 within them.
 
     The impact keeps the angular momentum about the soles' middle: the CoM goes on as an inverted
     pendulum that has it, and would come to rest over the capture point.
@@ -167,7 +167,7 @@ def foot_turn(r: Replay) -> np.ndarray:
 
 
 def _place(r: Replay, task: JumpTask) -> Iterator[Measure]:
-    """Where the feet of a jump out of the plane stand in the end, and how far they turned."""
+    """Place and turn of the feet at the end of a jump out of the plane, against the target."""
     end = r.tape.t[-1:]
     feet = r.tape.contact_frames
     first, last = r.sole_points[[0, -1]].mean(axis=2)  # (K, 3) middles of the soles

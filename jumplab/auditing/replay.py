@@ -164,7 +164,7 @@ class Replay:
         return self.task.along_rad if self.task else 0.0
 
     def along(self, points: np.ndarray) -> np.ndarray:
-        """How far points (..., 3) [m] lie along the axis on which the surfaces change [m]."""
+        """Coordinate of points (..., 3) [m] along the axis on which the surfaces change [m]."""
         return points[..., :2] @ [np.cos(self.course_rad), np.sin(self.course_rad)]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What an audit looks at and says: limits (``limits.toml``), checks, and the report of them."""
+"""Limits (``limits.toml``) and checks of an audit, and the report of them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,9 @@ class Check:
 
 @dataclass(frozen=True)
 class Limit:
-    """What a check allows: ``limit`` in ``unit``; ``note`` says what is measured, with braces."""
+    """Limit of a check: ``limit`` in ``unit``; ``note`` is the text on the measurement, with
+    braces.
+    """
 
     group: str
     name: str
@@ -112,7 +114,7 @@ class AuditReport(Shown):
     ``capture`` is none of the checks: how far outside the soles the robot would come to rest from
     the momentum that it lands with; None of what is no standing jump. A plan can be sound and still
     not be caught.
-    The manifest tells robot and its hash, target, number of samples, package versions;
+    The manifest has robot and its hash, target, number of samples, package versions;
     :func:`jumplab.auditing.write_audit` adds the plan's digest and the planner's own summary.
     """
 
@@ -121,7 +123,9 @@ class AuditReport(Shown):
     capture: Check | None = None
 
     def line(self) -> str:
-        """How many checks passed, and which did not; and whether it lands too fast to be caught."""
+        """Number of checks that passed, names of those that failed, and whether the jump lands too
+        fast to be caught.
+        """
         words = f"all {len(self.checks)} checks passed"
         if not self.passed:
             names = ", ".join(c.name for c in self.failed)
@@ -130,12 +134,14 @@ class AuditReport(Shown):
 
     @property
     def sound(self) -> bool:
-        """True if every check passed, and nothing speaks against catching the landing."""
+        """True if every check passed, and the landing can be caught as far as the capture point
+        shows.
+        """
         return self.passed and not self.uncaught
 
     @property
     def uncaught(self) -> str:
-        """Why a landing can hardly be caught; empty if nothing speaks against it."""
+        """Reason why a landing can hardly be caught; empty if there is none."""
         c = self.capture
         if c is None or c.passed:
             return ""

@@ -1,4 +1,4 @@
-"""What the commands share: how their options are read, and what is printed of a result.
+"""Code that commands share: it reads their options, and prints results.
 
 Help and refusals do not wait for the heavy libraries: ``jl`` and the sub-packages load them late.
 """
@@ -110,7 +110,8 @@ def declare(
         options = dict(OPTIONS[name])
         example = options.pop("example", None)
         help_ = text[:1].lower() + text[1:].rstrip(".")
-        one = below.add_parser(name, help=help_, epilog=example and f"example: jumplab {example}")
+        example = example and f"example: jumplab {example}"
+        one = below.add_parser(name, help=help_, description=text, epilog=example)
         one.set_defaults(work=work)
         shared = {usage: OPTIONS["shared"][usage] for usage in options.pop("shared", ())}
         for usage, how in (shared | options).items():
@@ -173,7 +174,9 @@ def named(must: str, pair: str) -> tuple[str, str]:
 
 
 def disturbances(option: str, pairs: Sequence[str]) -> dict[str, tuple[float, ...]]:
-    """What was given as NAME=SIZE or NAME=FROM:TO, several times: name -> (size,) or (from, to)."""
+    """Read options of the form NAME=SIZE or NAME=FROM:TO, given several times: name -> (size,) or
+    (from, to).
+    """
     sizes: dict[str, tuple[float, ...]] = {}
     must = f"{option} must be NAME=SIZE or NAME=FROM:TO"
     for pair in pairs:
@@ -191,7 +194,7 @@ def without(args: argparse.Namespace, why: str, **options: Any) -> None:
     """
     for name, default in options.items():
         if getattr(args, name) != default:
-            raise InputError(f"--{name.replace('_', '-')} {why}; leave it away")
+            raise InputError(f"--{name.replace('_', '-')} {why}; leave it out")
 
 
 def given(function: Callable, args: argparse.Namespace, **more: Any) -> dict[str, Any]:
@@ -212,12 +215,12 @@ def resumed(function: Callable, args: argparse.Namespace, kept: str = "trials", 
         return function(**given(function, args, **more))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted; finished {kept} are kept, and the same command goes on from there"
+            f"interrupted; finished {kept} are kept, and the same command resumes from there"
         ) from None
 
 
 def judge(audit: Any, folder: str) -> None:
-    """Say that the audit of the plan in ``folder`` is clean, or refuse it
+    """Say that the plan in ``folder`` passes its audit, or refuse it
     (:class:`InfeasibleError`).
     """
     count = len(audit.checks)
@@ -237,7 +240,7 @@ def print_summary(summary: Mapping[str, Any]) -> None:
     if summary.get("method") == "three-step" and all(
         x["stage"][0] != "2" for x in summary["stages"]
     ):
-        print("without stage 2, which follows no flip")
+        print("without stage 2, which cannot follow a flip")
     line = "planned: distance {planned_distance_m:.3f} m, rise {planned_rise_m:.3f} m"
     if summary.get("planned_side_m") is not None:
         line += ", side {planned_side_m:.3f} m, turn {turn_deg:.1f} deg"
@@ -246,7 +249,7 @@ def print_summary(summary: Mapping[str, Any]) -> None:
 
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:
-    """What the simulation made of it."""
+    """Print distance, rise, landing and failed checks of a simulation."""
     lengths = (metrics["foot_distance_m"], metrics["com_rise_m"])
     distance, rise = ("none" if x is None else f"{x:.3f} m" for x in lengths)
     print(f"simulated: distance {distance}, rise {rise}")

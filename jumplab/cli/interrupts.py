@@ -1,5 +1,5 @@
-"""Ctrl-C and SIGTERM: a command ends within two seconds, with 130 or 143, and what it was working
-on is no result.
+"""Ctrl-C and SIGTERM: a command ends within two seconds, with 130 or 143, and leaves no partial
+result.
 """
 
 import contextlib
@@ -71,7 +71,7 @@ class Interrupts:
             return
         self.number = number
         threading.Thread(target=self._insist, args=(sys.stderr,), daemon=True).start()
-        # CasADi and half-ended libraries would speak of it too
+        # CasADi and half-ended libraries would print messages too
         sys.stderr = open(os.devnull, "w")
         sys.unraisablehook = lambda _: None
         raise Stopped

@@ -56,7 +56,7 @@ def run(args: Namespace) -> None:
 
 
 def plan(args: Namespace) -> None:
-    """The optimisations and the audit alone."""
+    """Plan and audit a jump, without the notebooks."""
     start = time.perf_counter()
     task = JumpTask(**given(JumpTask, args))
     if args.contacts:
@@ -84,7 +84,7 @@ def plan(args: Namespace) -> None:
 
 
 def audit(args: Namespace) -> None:
-    """Check a plan by an independent implementation."""
+    """Check a plan with an independent implementation."""
     from jumplab.auditing import write_audit
 
     io.folder.read_plan(args.dir)  # refuses a damaged folder
@@ -124,7 +124,7 @@ def simulate(args: Namespace) -> None:
 
 
 def view(args: Namespace) -> None:
-    """A jump in 3-D, as one HTML file, or as a moving picture."""
+    """Show a jump in 3-D, as one HTML file, or make an animation of it."""
     if args.movie:
         without(args, "names the page, and --movie is given instead of it", out=None)
     tape, robot, summary = io.folder.read_plan(args.dir)
@@ -154,7 +154,7 @@ def view(args: Namespace) -> None:
 
 
 def export(args: Namespace) -> None:
-    """A jump of the whole robot for other programs."""
+    """Export a jump of the whole robot for other programs."""
     tape, robot, _ = io.folder.read_plan(args.dir)
     motion = io.motion.Motion.of(tape)
     if args.simulated:

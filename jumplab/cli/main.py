@@ -41,7 +41,7 @@ INTERNAL = 4
 
 
 def completion(args: argparse.Namespace) -> None:
-    """Completion of commands and options: eval "$(jumplab completion bash)"."""
+    """Print the completion of commands and options: eval "$(jumplab completion bash)"."""
     import shtab
 
     args.found["script"] = shtab.complete(make_parser(), args.shell)
@@ -153,6 +153,6 @@ def _main(argv: list[str], alone: bool) -> int:
 
         print(to_json({**results, "exit_code": code, "error": sentence}), end="", flush=True)
     if alone and interrupts.number is not None:
-        logging.disable()  # papermill would tell that its kernel has died
+        logging.disable()  # papermill would print that its kernel has died
         end_soon(code)
     return code

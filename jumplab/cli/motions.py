@@ -19,7 +19,7 @@ NEAR = 0.03  # relative, of two rates that are the same
 
 
 def judge(args: Namespace) -> None:
-    """Judge motion clips: what of them no robot could do."""
+    """Judge motion clips: find motions that no robot could do."""
     found = jl.judge(args.file, args.robot, fps=args.fps, order=args.order)
     reports = found if isinstance(found, list) else [found]
     passed = sum(report.passed for report in reports)
@@ -72,7 +72,7 @@ def _write(folder: str, reports: list[Any], found: dict[str, Any]) -> None:
 
 
 def mend(args: Namespace) -> None:
-    """The nearest motion to a clip that the robot can do, as a plan."""
+    """Mend a motion clip: plan the nearest motion that the robot can do."""
     from jumplab.auditing import write_audit
 
     mended = jl.mend(args.file, args.robot, fps=args.fps, order=args.order)

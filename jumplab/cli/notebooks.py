@@ -48,7 +48,7 @@ def check_parameters(namespace: Mapping[str, Any]) -> None:
     that cannot be meant.
 
     papermill merely warns of an unknown name and then runs with the default. Call this in the cell
-    after the parameters, with its ``globals()``. What a parameter may be stands in the parameters'
+    after the parameters, with its ``globals()``. The kind of a parameter stands in the parameters'
     cell: its annotation and, of a whole number, a comment that begins with the range, as in
     ``samples: int = 200  # 1 ... 10000, random states``. An ``engine`` must be there.
     """
@@ -86,8 +86,8 @@ def check_value(name: str, value: Any, kind: type | range | None) -> None:
 
 
 def declared_parameters(notebook: Path) -> Kinds:
-    """What the parameters of a notebook may be, see :func:`check_parameters`; read without running
-    it. Raises :class:`InputError` if it cannot be read.
+    """Kinds of the parameters of a notebook, see :func:`check_parameters`; read without running it.
+    Raises :class:`InputError` if it cannot be read.
     """
     from papermill import inspect_notebook
 
@@ -114,7 +114,7 @@ def _literal(path: Path) -> str:
 
 @dataclass(frozen=True)
 class RunReport:
-    """Where a finished chain of notebooks put its things, and how long it took."""
+    """Places of the results of a finished chain of notebooks, and its duration."""
 
     out: Path  # result folder: plan, simulation, and the executed notebooks in ``notebooks``
     figures: Path
@@ -133,7 +133,7 @@ def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
     paths = next(filter(None, (sorted(place.glob(PATTERN)) for place in places)), None)
     if paths is None:
         there = " nor in ".join(repr(str(place)) for place in places)
-        raise InputError(f"no notebooks in {there}; install jumplab anew")
+        raise InputError(f"no notebooks in {there}; install jumplab again")
     named = {name: path for path in paths for name in (path.stem, path.stem[:2])}
     for name in names:
         if name not in named:
@@ -342,7 +342,9 @@ def _kernel(scratch: str, notebook: Path, work: Path, groups: list[int]) -> type
 
 
 def publish(work: Path, out: Path, figures: Path) -> None:
-    """Move the results in ``work`` to ``out``, and its figures, but those that look the same."""
+    """Move the results in ``work`` to ``out``, and its figures, but those that look the same; of
+    these only captions that changed.
+    """
     io.folder.settle()
     with io.folder.transaction(out) as staging:
         for p in (work / "result").iterdir():
@@ -354,8 +356,15 @@ def publish(work: Path, out: Path, figures: Path) -> None:
         p.with_suffix("") for p in files if p.suffix == ".png" and _alike(made / p, figures / p)
     }
     for p in files:
-        if p.with_suffix("") not in same:
-            io.folder.write_file(figures / p, (made / p).read_bytes())
+        old = figures / p
+        kept = p.with_suffix("") in same
+        if not kept or (p.suffix == ".txt" and _caption(made / p) != _caption(old)):
+            io.folder.write_file(old, (made / p).read_bytes())
+
+
+def _caption(path: Path) -> list[str]:
+    """Lines of a figure's text, without its last one, the versions; none if it is missing."""
+    return path.read_text(encoding="utf-8").splitlines()[:-1] if path.is_file() else []
 
 
 def _alike(new: Path, old: Path) -> bool:

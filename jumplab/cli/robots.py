@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # help of a command is there before NumPy is
 
 
 def list_(args: Namespace) -> None:
-    """The shipped robots."""
+    """List the robots that have a name."""
     from jumplab.robot.files import SHIPPED
     from jumplab.robot_import.urdf import DESCRIPTIONS
 
@@ -59,7 +59,7 @@ def check(args: Namespace) -> None:
     if args.repair and (args.config is not None or shipped):
         raise InputError(
             "--repair is for a bare URDF; a configuration has its own [source] repair, so leave it "
-            "away"
+            "out"
         )
     if args.config is not None:
         try:
@@ -99,7 +99,7 @@ def check(args: Namespace) -> None:
 
 
 def robot(args: Namespace) -> None:
-    """The robots that are there, and whether a URDF can jump."""
+    """List the robots that have a name, or check whether a URDF can jump."""
     raise InputError(
         "jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is "
         "possible"
@@ -135,8 +135,8 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
 
 
 def _write(folder: str | None, text: str, force: bool) -> Path | None:
-    """Write a starter configuration, but not over another one, which somebody may have edited; its
-    path, or None without a folder.
+    """Write a starter configuration, but not over another one, which a user may have edited;
+    returns its path, or None without a folder.
     """
     from jumplab.robot import files
 

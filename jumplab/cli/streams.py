@@ -14,7 +14,7 @@ from typing import Any, TextIO
 class Patient:
     """A text stream without the errors of writing; ``lost`` gets the reason of the first one.
 
-    A reader that has gone is no reason: nobody wants the rest.
+    A reader that has gone is no reason: the rest is not needed.
     """
 
     def __init__(self, stream: TextIO, lost: list[str]):

@@ -31,7 +31,7 @@ ASKED = {"foot_distance_m": "distance_m", "com_rise_m": "height_m"}  # metrics b
 
 
 def trials(args: Namespace) -> None:
-    """Let many perturbed robots jump a plan."""
+    """Play a plan on many perturbed robots."""
     if args.basin:
         why = "is for robots that are drawn, and --basin draws none"
         without(args, why, seed=None, disturb=[], keep_falls=0)
@@ -66,7 +66,7 @@ def _settings(args: Namespace, **more: Any) -> Any:
 
 
 def margins(args: Namespace) -> None:
-    """The largest size of each disturbance that a plan tolerates."""
+    """Find the largest size of each disturbance that a plan tolerates."""
     names = args.disturb or (*studies.margins.SINGLE, *studies.margins.PAIRS)
     options = {"folder": args.dir, "seed": args.seed or 0, "settings": _settings(args)}
     report = resumed(studies.margins.margins, args, names=names, **options)
@@ -76,7 +76,7 @@ def margins(args: Namespace) -> None:
 
 
 def certify(args: Namespace) -> None:
-    """Do two physics agree on a plan? Audit, both engines, two modes, both contacts."""
+    """Certify a plan: audit, then both physics engines in two modes, with both contacts."""
 
     def page(certificate: Any) -> str:
         return jl.plots.certificate_page(certificate).html
@@ -107,7 +107,7 @@ def certify(args: Namespace) -> None:
 
 
 def clips(args: Namespace) -> None:
-    """Thirty jumps to all sides, planned, audited, landed alike in both engines, as clips."""
+    """Make a library of clips: thirty jumps to all sides, audited and landed in both engines."""
     options = {"format_name": args.format, "say": print}
     library = resumed(studies.clips.make_clips, args, "clips", **options)
     args.found |= {"out": args.out} | library
@@ -120,7 +120,7 @@ def clips(args: Namespace) -> None:
 
 
 def chain(args: Namespace) -> None:
-    """Several jumps in a row, each planned while the one before lands."""
+    """Simulate several jumps in a row, each planned while the one before lands."""
     if args.runs == 1:
         without(args, "is for several --runs", jobs=None)
         if args.seed is None:
@@ -190,9 +190,9 @@ def _print_chain(result: Any, series: dict[str, Any] | None) -> None:
 
 
 def envelope(args: Namespace) -> None:
-    """Map of the jumps that a robot can do."""
+    """Map the jumps that a robot can do."""
     if args.side_m is not None and args.yaw_rad is not None:
-        raise InputError("--side-m and --yaw-deg are two maps; leave one of them away")
+        raise InputError("--side-m and --yaw-deg are two maps; leave one of them out")
     if args.side_m is not None and len(args.height_m) != 1:
         raise InputError(
             f"a map of sides has one height, got {len(args.height_m)}; give --height-m one number"
@@ -223,7 +223,7 @@ def envelope(args: Namespace) -> None:
 
 
 def record(args: Namespace) -> None:
-    """How far a robot can go in one number of the target, what ends it, what more would buy."""
+    """Find the best jump of a robot in one number, such as its rise, and the limits that end it."""
     numbers = {name: getattr(args, name) for name in TARGET if getattr(args, name) is not None}
     task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers) if numbers else None
     options = given(studies.record.record, args, given=task)
@@ -256,7 +256,7 @@ def record(args: Namespace) -> None:
 
 
 def atlas(args: Namespace) -> None:
-    """Plan a grid once: any target between its nodes is then a few steps away."""
+    """Plan a grid of targets once; plans between its nodes then start from it."""
     axes = {"distances": args.distance_m, "heights": args.height_m}
     built = resumed(studies.atlas.Atlas.build, args, "nodes", folder=args.out, **axes)
     count = math.prod(map(len, axes.values()))
@@ -279,7 +279,7 @@ def choices_of(option: str, pairs: list[str]) -> list[dict[str, float]]:
 
 
 def sweep(args: Namespace) -> None:
-    """Plans for a grid of targets, robots and weights, in one table."""
+    """Plan a grid of targets, robots and weights, into one table."""
     weights = choices_of("--weight must be TERM", args.weight)
     if args.cluster:
         without(
@@ -301,9 +301,7 @@ def sweep(args: Namespace) -> None:
 
 
 def bench(args: Namespace) -> None:
-    """How long planning takes: straight ahead, from a neighbour, from an atlas, in three steps,
-    aside, flips.
-    """
+    """Measure the time of planning, one kind of jump and one method after another."""
     task = JumpTask(args.distance_m, args.height_m)
     benchmark = paper("planning_times")
     times = benchmark.bench(args.robot, task, args.repeats, say=tell)

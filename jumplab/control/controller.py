@@ -50,7 +50,7 @@ YIELD_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Hardware:
-    """What a controller knows of the drives, sensors and time steps that it works with."""
+    """Drives, sensors and time steps that a controller works with, as far as it knows them."""
 
     # torques are known to arrive so late; until touchdown, they are sent ahead
     delay_s: float = 0.0
@@ -162,7 +162,7 @@ class Controller:
         return self.landing.step.began_s
 
     def to_json(self) -> dict:
-        """What the settings of a result say."""
+        """Settings of this controller, for the settings of a result."""
         feedback = self.feedback and self.feedback.to_json()
         return dict(feedback=feedback, landing=self.ahead.to_json())
 
@@ -173,7 +173,7 @@ class Controller:
         return self.drive(t, state).torque(state.q[7:], state.v[6:])
 
     def drive(self, t: float, state: State) -> Drive:
-        """What the joints' drives are sent at ``t`` since the tape began [s], from the measured
+        """Values to send to the joints' drives at ``t`` since the tape began [s], from the measured
         ``state``; to be called once in each :data:`~jumplab.control.STEP_S`.
         """
         command = self.command(round(t / STEP_S), state.along(self.looks_rad))
@@ -182,8 +182,8 @@ class Controller:
         return self._servo.drive(command, *(command.state or state[:2]))
 
     def command(self, step: int, state: State) -> Command:
-        """What the joints shall do at ``step``, from the state as it is seen along the heading of
-        the landing.
+        """Command to the joints at ``step``, from the state as it is seen along the heading of the
+        landing.
         """
         if step == 0 and self._at_rest:
             self.playback.approach(state.q)

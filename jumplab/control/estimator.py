@@ -1,10 +1,10 @@
-"""Where the robot is and how it moves, from its own sensors: an error-state Kalman filter, inertial
-unit and legs.
+"""Estimate of the robot's place and motion from its own sensors, inertial unit and legs: an
+error-state Kalman filter.
 
 The trunk is integrated from gyro and accelerometer. While a foot carries weight, the point it
-stands on does not move: the legs' angles then tell where the trunk is, and through gravity also how
-it is tilted. That feet are part of the state is an idea of Bloesch et al., "State estimation for
-legged robots" (2012).
+stands on does not move: the legs' angles then give the place of the trunk, and through gravity also
+its tilt. That feet are part of the state is an idea of Bloesch et al., "State estimation for legged
+robots" (2012).
 """
 
 from __future__ import annotations
@@ -211,7 +211,9 @@ class Estimator:
 
 
 def _end_of(arm: np.ndarray) -> np.ndarray:
-    """How the error moves (3, SIZE) a point that is ``arm`` (3,) from the trunk, world axes."""
+    """Derivative (3, SIZE) by the error of the place of a point that is ``arm`` (3,) from the
+    trunk, world axes.
+    """
     sense = np.zeros((3, SIZE))
     sense[:, PLACE] = np.eye(3)
     sense[:, TURN] = -pin.skew(arm)

@@ -137,8 +137,8 @@ class Flight:
         return end, rates
 
     def _longest_wait(self, robot: Robot, rates: np.ndarray) -> float:
-        """How long [s] the tuck may wait, and still open within the speed limits of the joints,
-        whose ``rates`` (N, nv - 6) are those of the tape.
+        """Longest time [s] that the tuck may wait, and still open within the speed limits of the
+        joints, whose ``rates`` (N, nv - 6) are those of the tape.
         """
         faster = robot.limits.speed / np.maximum(np.abs(rates), NOTHING)
         opens = self.end_s - self.tight_s
@@ -170,8 +170,8 @@ class Flight:
         return t, left_s if np.isfinite(left_s) else max(self.end_s - t, STEP_S)
 
     def turn_ahead(self, step: int, now: Motion, left_s: float) -> np.ndarray:
-        """How far (3, 3) the trunk will be turned off its planned attitude at touchdown, about all
-        axes, in ``left_s``; of a shifted tape, :meth:`shift` comes first.
+        """Rotation (3, 3) from the trunk's planned attitude at touchdown to the one expected after
+        ``left_s``, about all axes; of a shifted tape, :meth:`shift` comes first.
 
         It turns by I^-1 (L - h) in its own axes, with the L that is measured, and I and h along the
         tape.

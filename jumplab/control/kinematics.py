@@ -1,5 +1,5 @@
-"""What a configuration of the full robot says: attitude and pitch of the trunk, places of CoM and
-soles.
+"""Kinematics of a configuration of the full robot: attitude and pitch of the trunk, places of CoM
+and soles.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ LEVEL = np.eye(7)[6]  # place and quaternion (7,) of a base at the origin, not t
 
 
 class State(NamedTuple):
-    """What is measured of a robot at one time."""
+    """Measured state of a robot at one time."""
 
     q: np.ndarray  # (nq,) configuration
     v: np.ndarray  # (nv,) velocity
@@ -23,14 +23,14 @@ class State(NamedTuple):
     wrench: np.ndarray
 
     def along(self, heading_rad: float) -> State:
-        """The same, as somebody sees it who looks along a heading."""
+        """The same, as seen along a heading."""
         if heading_rad == 0:
             return self
         return State(headed(self.q, heading_rad), self.v, turned_wrench(self.wrench, heading_rad))
 
 
 class Motion(NamedTuple):
-    """How the robot as a whole is and moves in one state; world axes."""
+    """Place and motion of the robot as a whole in one state; world axes."""
 
     q: np.ndarray  # (nq,) configuration
     com: np.ndarray  # (3,) [m]
@@ -57,7 +57,7 @@ def about_vertical(angle_rad: float) -> np.ndarray:
 
 
 def yaw_of(turn: np.ndarray) -> float:
-    """How far a rotation (3, 3) turns about the vertical, whatever it tilts besides [rad]."""
+    """Angle of a rotation (3, 3) about the vertical, whatever it tilts besides [rad]."""
     z, w = pin.Quaternion(turn).coeffs()[2:]
     return float(2 * np.arctan2(z if w >= 0 else -z, abs(w)))
 
@@ -71,7 +71,7 @@ def pitch_of(q: np.ndarray) -> np.ndarray:
 
 
 def headed(q: np.ndarray, heading_rad: float) -> np.ndarray:
-    """Configurations (..., nq) as somebody sees them who looks along ``heading_rad``; ``q`` itself
+    """Configurations (..., nq) as seen along ``heading_rad``; ``q`` itself
     if that is zero.
     """
     if heading_rad == 0:
@@ -85,7 +85,7 @@ def headed(q: np.ndarray, heading_rad: float) -> np.ndarray:
 
 
 def turned_wrench(wrench: np.ndarray, heading_rad: float) -> np.ndarray:
-    """Wrenches (..., 6) as somebody sees them who looks along ``heading_rad``."""
+    """Wrenches (..., 6) as seen along ``heading_rad``."""
     halves = wrench.reshape(*wrench.shape[:-1], 2, 3) @ about_vertical(heading_rad)
     return halves.reshape(wrench.shape)
 
@@ -121,7 +121,9 @@ class Gauge:
         return np.array([foot.act(corner) for foot in self.places(q) for corner in corners])
 
     def heading(self, q: np.ndarray) -> float:
-        """Where the feet point in ``q`` (nq,), seen from above, within half a turn of +x [rad]."""
+        """Direction in which the feet point in ``q`` (nq,), seen from above, within half a turn of
+        +x [rad].
+        """
         x, y = np.sum([foot.rotation[:2, 0] for foot in self.places(q)], axis=0)
         return float(np.arctan2(y, x))
 
@@ -130,7 +132,7 @@ class Gauge:
         return pin.centerOfMass(self.model, self.data, q, False).copy()
 
     def motion(self, q: np.ndarray, v: np.ndarray) -> Motion:
-        """How the robot moves in ``q`` (nq,) and ``v`` (nv,)."""
+        """Motion of the whole robot in ``q`` (nq,) and ``v`` (nv,)."""
         data = self.data
         pin.ccrba(self.model, data, q, v)
         velocity = data.hg.linear / self.robot.total_mass

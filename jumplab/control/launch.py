@@ -4,17 +4,18 @@ A tape that is followed joint by joint moves a robot unlike its plan, or one tha
 in, with another momentum and over another place: its feet tip, and on its toes it falls on like a
 pendulum. Here, every 2 ms, joint accelerations and foot wrenches are chosen that obey the base
 dynamics, friction, the soles' edges and the motors' torques, and come closest to the planned CoM,
-its velocity, the angular momentum and the planned joints, with the feet moving on as they do. What
-the joints' accelerations differ by from the tape's is integrated and added to it, and so are the
-torques that go with them.
+its velocity, the angular momentum and the planned joints, with the feet moving on as they do. The
+difference of the joints' accelerations from the tape's is integrated and added to it, and so are
+the torques that go with them.
 
 Feet that creep, as on contacts that give way, take the planned place of the CoM along, or the
 forces on them would turn the body. Its planned velocity is that in the world, and what the feet
 have lost of their way until take-off is made good by speed.
 
-Feet that stand flat tell where the CoM really is: a load that the trunk carries besides pushes them
-by its mass times the acceleration of the trunk, and turns them by that push about where it is. Its
-mass and place are filtered from the wrenches, and the real CoM is led along the planned one's way.
+Feet that stand flat measure where the CoM really is: a load that the trunk carries besides pushes
+them by its mass times the acceleration of the trunk, and turns them by that push about where it is.
+Its mass and place are filtered from the wrenches, and the real CoM is led along the planned one's
+way.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from jumplab.robot.legs import BASE, leg_columns
 FRICTION = 0.6  # more than plans use, less than most floors have
 LENGTH_SHARE = 0.95  # of the sole for the CoP
 LEAST_LOAD = 0.5  # [1] of the weight; with less on the feet nothing is changed any more
-FELT_LOAD = 0.7  # [1] of the weight, with which feet tell where the CoM is ...
+FELT_LOAD = 0.7  # [1] of the weight, with which feet measure where the CoM is ...
 STILL_RAD = 0.01  # ... unless they are tilted by so much
 ROLLING_S = 0.1  # before the heels rise: the CoP is on its way to the toes, and soles begin to tip
 MOST_OFF_M = 0.025  # that the CoM is believed to be off
@@ -162,7 +163,7 @@ class LaunchFeedback:
         return (wrench[:, 3:] + np.cross(arms, wrench[:, :3])).sum(axis=0)
 
     def to_json(self) -> dict:
-        """What the settings of a result say."""
+        """Counts and deviations of the launch, for the settings of a result."""
         return {
             "solves": self.solver.solves,
             "failures": self.solver.failures,
@@ -244,8 +245,8 @@ class LaunchFeedback:
     def _solve(
         self, due: int, stand: Stand, q: np.ndarray, v: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """What the joints' accelerations (nv - 6,) shall differ by from those of the tape's step
-        ``due``, and the motors' torques (nv - 6,) with that [N m], None without a solution.
+        """Differences (nv - 6,) from the tape's joint accelerations at step ``due``, and the
+        motors' torques (nv - 6,) with them [N m], None without a solution.
         """
         body = self._body
         carries = np.array(stand) > tapes.AIR

@@ -30,7 +30,7 @@ WAY_BACK = Polynomial([1.0, 0.0, 0.0, -10.0, 15.0, -6.0])  # of time, smooth at 
 
 @dataclass(frozen=True)
 class Command:
-    """What the joints shall do in one step: move, as the servo sees to, or just give a torque."""
+    """Command to the joints for one step: a motion, which the servo follows, or only a torque."""
 
     q: np.ndarray | None = None  # (nv - 6,) [rad]
     rate: np.ndarray | None = None  # (nv - 6,) [rad/s]
@@ -82,7 +82,7 @@ class Playback:
         self._moves = int(np.argmax([*moved[:-1], True]))
 
     def stands(self, step: float) -> Stand:
-        """How the feet stand by the plan."""
+        """Contact of the left and of the right foot by the plan."""
         left, right = self._stands[min(max(int(step), 0), self.steps)].tolist()
         return left, right
 

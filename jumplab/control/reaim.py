@@ -1,9 +1,9 @@
 """Optional correction in flight: legs are put where they can catch the robot.
 
 A shove, or a robot unlike its plan, leaves speed, momentum and attitude other than planned, about
-all axes. What flies can no longer change the first two; where the soles meet the ground it still
-can. Legs that swing forward turn the trunk forward, and arms that swing back hold it: where the
-trunk will be far off its plan, both are reckoned with.
+all axes. A flying robot can no longer change the first two; where the soles meet the ground it
+still can. Legs that swing forward turn the trunk forward, and arms that swing back hold it: where
+the trunk will be far off its plan, both are reckoned with.
 """
 
 from __future__ import annotations
@@ -138,8 +138,8 @@ class Reaim:
         return correction, back.T @ level
 
     def _shifts(self, speed: np.ndarray, momentum: np.ndarray, fall: float) -> np.ndarray:
-        """How far (2, 3) the soles have to be from their planned places under the CoM [m], at the
-        speed downwards ``fall`` [m/s] at touchdown.
+        """Shifts (2, 3) of the soles from their planned places under the CoM [m] that are needed at
+        the speed downwards ``fall`` [m/s] at touchdown.
         """
         roll, pitch = momentum[:2] / self._gauge.robot.total_mass - self._tipping
         down = self._middle[2]
@@ -175,9 +175,7 @@ class Reaim:
         return guess[7:] - self._end[7:], level  # zero but for the limbs
 
     def _turns(self, q: np.ndarray, joints: np.ndarray) -> np.ndarray:
-        """How far (3, k) the body turns per angle of the ``joints`` (k,); not at all, unless its
-        arms swing.
-        """
+        """Turn (3, k) of the body per angle of the ``joints`` (k,); zero unless its arms swing."""
         if not self._far:
             return np.zeros((3, len(joints)))
         data = self._gauge.data

@@ -95,8 +95,8 @@ class LandingAhead:
     def follow(
         self, time: float, q: np.ndarray, v: np.ndarray, reference: LandingPlan
     ) -> LandingPlan:
-        """What to follow at ``time`` since touchdown [s] from the measured ``q`` (nq,) and ``v``
-        (nv,); ``reference`` is followed so far.
+        """Reference to follow at ``time`` since touchdown [s] from the measured ``q`` (nq,) and
+        ``v`` (nv,); ``reference`` is followed so far.
         """
         if self._next is not None and time >= self._next.t[0] + LATENCY_S - STEP_S / 2:
             reference = self._next
@@ -120,7 +120,7 @@ class LandingAhead:
         return reference
 
     def to_json(self) -> dict:
-        """What the settings of a result say."""
+        """Account of the landing's plans, for the settings of a result."""
         planned = dict.fromkeys(("planned_at_s", "time_left_s", "solve_s", "in_time"))
         return {
             "asked": self.source,

@@ -3,13 +3,13 @@
 "position" are drives that hold angles, "pd" adds their errors to the planned torque, "whole-body"
 measures base and joints and sees no planned torque. That one sums what the motion takes and what
 its errors ask for, both from the planned robot at the measured state and with the feet standing as
-they do in the plan. What the joints' accelerations a_j take is inverse dynamics; those of the base
-a_b and the wrenches f on the feet go with it,
+they do in the plan. The torques for the joints' accelerations a_j are inverse dynamics; those of
+the base a_b and the wrenches f on the feet go with it,
 
     min over a_b, f   1/2 |J a + J' v|^2 + epsilon/2 |f - f_p|^2   so that   M a + h = J^T f   in
     the rows of the base,
 
-where f_p is the plan's: what feet push against each other no joint's motion tells.
+where f_p is the plan's: no joint's motion shows how feet push against each other.
 
 Errors are met by damping d, which acts on the velocity v+ that the step ends with, so that it may
 be far stiffer than what is computed from the velocity before the step,
@@ -69,7 +69,7 @@ UNITS = np.repeat([1.0, LEVER_M], 3)
 
 @dataclass(frozen=True)
 class Drive:
-    """What the joints' drives are sent: a torque, and angles and rates to hold.
+    """Values that are sent to the joints' drives: a torque, and angles and rates to hold.
 
     A drive gives tau + kp (q - its angle) + kd (rate - its rate) from its own encoder, until
     something newer arrives.
@@ -89,17 +89,17 @@ class Drive:
 
 
 class PositionServo:
-    """Position drives: each joint is sent an angle and a rate, and measures its own; nobody knows
+    """Position drives: each joint is sent an angle and a rate, and measures its own; no drive knows
     the base, the feet or another joint.
 
     Where a drive has no error it gives no torque, so the angle that is sent lies ahead of the
     planned one by the planned torque over the stiffness, also beyond the joint's range: cut off
-    there, a joint near its stop would get too little torque.
-    Stiffness is scaled by a motor's effort, damping by the stiffness, both within what a cycle of
-    1 ms can hold on the joint's own inertia, that of the robot in its stance with all other joints
-    free. ``late_s`` makes no difference here: the loop is closed in the drive. What is held for a
-    step, which a simulator takes in ``substeps`` semi-implicit ones, is felt (1 - 1/substeps) / 2
-    of it late on average, and planned torques change meanwhile.
+    there, a joint near its stop would get too little torque. Stiffness is scaled by a motor's
+    effort, damping by the stiffness, both within what a cycle of 1 ms can hold on the joint's own
+    inertia, that of the robot in its stance with all other joints free. ``late_s`` makes no
+    difference here: the loop is closed in the drive. A torque that is held for a step, which a
+    simulator takes in ``substeps`` semi-implicit ones, is felt (1 - 1/substeps) / 2 of it late on
+    average, and planned torques change meanwhile.
     """
 
     told = "target angles and rates; a drive measures its own joint"
@@ -113,7 +113,7 @@ class PositionServo:
         self.kd = np.minimum(STIFFNESS_TIME_S * self.kp, MOST_KD * inertia / STEP_S)
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
-        """What is sent for ``command``; the measured (q, v) are not used."""
+        """Values to send for ``command``; the measured (q, v) are not used."""
         ahead = command.q + (command.tau + self._late * command.change) / self.kp
         return Drive(0.0, ahead, command.rate, self.kp, self.kd)
 
@@ -143,7 +143,7 @@ class TorqueServo:
         self._legs = [leg - 6 for leg in leg_columns(robot)]
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
-        """What is sent for ``command`` at the measured (q, v)."""
+        """Values to send for ``command`` at the measured (q, v)."""
         tau = command.tau + self._late * command.change
         error = command.q - q[7:]
         rate_error = command.rate - v[6:]
@@ -185,7 +185,7 @@ class WholeBodyServo:
         self._anchors = {stand: on_feet(robot, at) for stand, at in self._pivots.items()}
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
-        """What is sent for ``command`` at the measured (q, v)."""
+        """Values to send for ``command`` at the measured (q, v)."""
         return Drive(self.torque(command, q, v))
 
     def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:

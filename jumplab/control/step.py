@@ -139,7 +139,7 @@ class RecoveryStep:
 
 
 def _capture_point(body: WholeBody) -> np.ndarray:
-    """Where the robot would come to rest (2,), seen from above [m]."""
+    """Point where the robot would come to rest (2,), seen from above [m]."""
     lowest = int(np.argmin(body.soles[:, 2]))
     return body.com[:2] + body.com_velocity[:2] * _pendulum_s(body, lowest)
 

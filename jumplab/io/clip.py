@@ -84,7 +84,9 @@ class Clip(Shown):
 
 @dataclass(frozen=True)
 class _Raw:
-    """What a file holds: base (n, 3) [m], its quaternions (n, 4) x y z w, joints (n, k) [rad]."""
+    """Content of a clip's file: base (n, 3) [m], its quaternions (n, 4) x y z w, joints (n, k)
+    [rad].
+    """
 
     base: np.ndarray
     turn: np.ndarray

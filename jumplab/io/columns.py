@@ -13,6 +13,7 @@ from jumplab.robot import Robot
 if TYPE_CHECKING:
     from jumplab.io.motion import Record
 
+SIDES = "left", "right"
 # short names of a robot's roles
 ROLES = {"hip": "hip_pitch", "ankle": "ankle_pitch", "shoulder": "shoulder_pitch"}
 
@@ -23,7 +24,7 @@ OF_JOINTS = {"position_rad": ("q", 7), "velocity_rad_s": ("v", 6), "torque_N_m":
 
 
 COM = ("com_x_m", "com_y_m", "com_z_m")
-FORCES = tuple(f"{foot}_foot_force_{x}_N" for foot in ("left", "right") for x in "xyz")
+FORCES = tuple(f"{foot}_foot_force_{x}_N" for foot in SIDES for x in "xyz")
 
 
 class Rows(Shown, tuple):
@@ -32,7 +33,7 @@ class Rows(Shown, tuple):
     __slots__ = ()
 
     def line(self) -> str:
-        """How many there are."""
+        """Number of rows."""
         return f"{len(self)} rows"
 
     __repr__ = tuple.__repr__
@@ -55,7 +56,9 @@ def table_of(record: Record, joints: Sequence[str], com: np.ndarray) -> dict[str
 
 
 class Columns(Mapping[str, np.ndarray]):
-    """Columns of a log by name: of a joint (N,), of a role such as "knee" (N, 2), left first."""
+    """Columns of a log by name: of a joint (N,), of a role such as "knee" (N, 2), left first, and
+    of one of its sides, such as "left_knee" (N,), whatever the joint is called.
+    """
 
     def __init__(self, values: np.ndarray, robot: Robot, unit: str):
         self._values = values
@@ -67,7 +70,11 @@ class Columns(Mapping[str, np.ndarray]):
             if pair
         }
         short = {name: self._pairs[role] for name, role in ROLES.items() if role in self._pairs}
-        self._columns = self._pairs | short | self._joints
+        roles = self._pairs | short
+        sides = {
+            f"{side}_{x}": pair[k] for x, pair in roles.items() for k, side in enumerate(SIDES)
+        }
+        self._columns = sides | roles | self._joints
 
     def __getitem__(self, name: str) -> np.ndarray:
         if not isinstance(name, str) or name not in self._columns:

@@ -200,7 +200,9 @@ def with_root(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
 
 
 def retargeted(whole: Whole, x: Motion, fps: float) -> dict[str, object]:
-    """What retargeters keep: rotations x y z w, ``local_body_pos`` (F, B, 3) in root axes [m]."""
+    """Fields of retargeters' files: rotations x y z w, ``local_body_pos`` (F, B, 3) in root axes
+    [m].
+    """
     places = whole.bodies(x, whole.links, at_com=False)["body_pos_w"] - x.q[:, None, :3]
     back = Rotation.from_quat(x.q[:, 3:7]).as_matrix()
     return {
@@ -237,7 +239,7 @@ def states(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
 
 
 def with_base(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
-    """What trainers in Isaac Lab keep of a motion: joints breadth-first, by name, and the base,
+    """Fields of the motions of trainers in Isaac Lab: joints breadth-first, by name, and the base,
     (F, 3) and quaternion (F, 4) w x y z, velocities in world axes at its origin; 32-bit floats.
     """
     arrays = tracked(whole, x, fps, order=ORDERS[1])

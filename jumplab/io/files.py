@@ -25,7 +25,7 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 LOCK_WAIT_S = 20.0  # a write lasts well under a second: after a longer wait something hangs
 LOCK_LOOK_S = 0.005  # between two looks whether a lock is free
-AT_SETTLE: list[Callable[[], None]] = []  # who wants to know, see settle
+AT_SETTLE: list[Callable[[], None]] = []  # functions to call, see settle
 
 
 def settle() -> None:
@@ -108,7 +108,7 @@ def locked(folder: Path, *, shared: bool = False, wait_s: float = LOCK_WAIT_S) -
 
     Raises :class:`InputError` if another process keeps it for longer than ``wait_s`` [s], counted
     in looks, so that on a busy machine it waits longer. A file system that knows no locks grants it
-    always: the hashes in the manifest then still tell a mix.
+    always: the hashes in the manifest then still show a mix.
     """
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:

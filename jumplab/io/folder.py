@@ -2,7 +2,7 @@
 
 A plan's folder holds ``plan.npz`` (the tape), ``robot.urdf`` and ``robot.toml`` (the robot it was
 planned for) and ``summary.json``, which comes last and whose ``manifest`` carries the SHA-256 of
-the others. What is said about that plan later (audit, simulation, trials) lies beside it.
+the others. Later results of that plan (audit, simulation, trials) lie beside it.
 
 New files are first written into ``.staging`` inside the folder. Renaming that to ``.commit`` is the
 one moment at which the new result exists; its files then replace the old ones. Killed before that
@@ -177,7 +177,7 @@ def write_plan(
     """Write a plan's folder; what an older plan left there, with its passport and simulation, goes.
 
     ``summary`` becomes ``summary.json``, with a ``manifest`` added: versions, robot, hashes of the
-    files. ``complete`` is called with the folder before anybody else sees it, to add files to it
+    files. ``complete`` is called with the folder before others see it, to add files to it
     (``write_audit``); what it returns is returned.
     """
     with transaction(folder) as staging:
@@ -274,7 +274,7 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
     the summary.
 
     Raises :class:`InputError` if the folder holds no finished plan, or a file is damaged or not the
-    one that the summary speaks of.
+    one that the summary names.
     """
     folder = as_path(folder, "a result folder")
     try:

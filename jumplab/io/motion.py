@@ -25,7 +25,7 @@ END_TOLERANCE = 1e-9  # [s], so that a grid of k / rate reaches the last sample 
 
 @runtime_checkable
 class Record(Protocol):
-    """What a motion is made from: a ``Tape`` or a ``SimulationResult``."""
+    """Record of a jump from which a motion is made: a ``Tape`` or a ``SimulationResult``."""
 
     t: np.ndarray
     q: np.ndarray
@@ -96,13 +96,17 @@ class Motion:
         Raises :class:`InputError` if a time lies outside the motion, or a quaternion is zero.
         """
         if not np.all(np.any(self.q[:, 3:7], axis=1)):
-            raise InputError("a quaternion of the base is zero, which is no attitude; make it anew")
+            raise InputError(
+                "a quaternion of the base is zero, which is no attitude; make the motion again"
+            )
         times = np.asarray(times, float)
         if len(times) and not (
             self.t[0] <= times.min() and times.max() <= self.t[-1] + END_TOLERANCE
         ):
             asked = f"{times.min():g} ... {times.max():g} s"
-            raise InputError(f"times {asked} leave the motion, {self.t[0]:g} ... {self.t[-1]:g} s")
+            raise InputError(
+                f"times {asked} are outside the motion, {self.t[0]:g} ... {self.t[-1]:g} s"
+            )
         row = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
         gap = self.t[row + 1] - self.t[row]
         share = np.ones(len(times))  # where the last instant stands twice

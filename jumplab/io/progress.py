@@ -1,4 +1,4 @@
-"""What long work is doing just now, for whoever wants to show it: the command line, a notebook.
+"""Messages on the progress of long work, for any display: the command line, a notebook.
 
 >>> with told_to(print):
 ...     tell("simulating", 12, 200)

@@ -59,7 +59,7 @@ class Whole:
         self._jumping = self._columns(robot.joint_names)
 
     def _columns(self, names: Iterable[str]) -> np.ndarray:
-        """Where joints are in Pinocchio's order, behind the base."""
+        """Columns of joints in Pinocchio's order, counted behind the base."""
         columns = [self.model.idx_vs[self.model.getJointId(name)] - 6 for name in names]
         return np.array(columns, int)
 
@@ -90,7 +90,7 @@ class Whole:
         """A motion at ``fps`` [1/s] and at its end, as one of the published robot from time 0 [s],
         its joints depth-first, those without a role held.
 
-        What holds them are the torques of inverse dynamics, at the mean acceleration between the
+        They are held by the torques of inverse dynamics, at the mean acceleration between the
         frames beside; what hangs on them touches nothing. Raises :class:`InputError` for rates that
         cannot be meant, and if the joints of the published robot are elsewhere than those of the
         robot that jumps, which was changed then.

@@ -1,4 +1,4 @@
-"""What the stages know of the robot, each as a source of named quantities at one instant.
+"""Models of the robot for the stages, each a source of named quantities at one instant.
 
 In: states and their rates. Out: momentum, inertia, forces, torques, and for the nine links their
 Jacobians. Start reading in :mod:`jumplab.models.srmp` (stage 1); then ``full.py`` (stage 2) and

@@ -210,7 +210,7 @@ class FullBody:
         return FullTerms(q, v, self.mass, turn, com, M, H, A_h, B_h, rho, slope, drift, *points)
 
     def _both(self, place: str) -> PointMotion:
-        """How a point of both feet moves, stacked."""
+        """Motion of a point of both feet, stacked."""
         left, right = (
             vars(point_motion(self.model, self.data, self.anchors[f"{side}_{place}"]))
             for side in SIDES

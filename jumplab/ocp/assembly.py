@@ -39,7 +39,7 @@ class Assembled:
     size, n_rows, p_size : numbers of variables, rows and data; p = [parameters; weights; per phase
         (share of the phase, references) of every node].
     rows, cost_terms : what the rows are; (owner, term) of every cost.
-    nlp, grad_f, jac_g, hess_lag : cost and rows with derivatives, as ipopt wants them.
+    nlp, grad_f, jac_g, hess_lag : cost and rows with derivatives, as ipopt needs them.
     functions_of_nlp : these four by name, see :func:`nlp_functions`.
     cost_parts, gauss_newton : unweighted costs; upper triangle of the cost's Hessian without the
         curvature of what it squares.
@@ -183,7 +183,7 @@ def gather(entries: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
 
 @dataclass(frozen=True)
 class Block:
-    """What one part contributes to the NLP: its functions, called at all of its nodes."""
+    """Contribution of one part to the NLP: its functions, called at all of its nodes."""
 
     part: Part
     functions: dict[str, ca.Function]

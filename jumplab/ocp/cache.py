@@ -1,4 +1,5 @@
-"""What takes long to make, for later problems and processes, in a folder that may be deleted.
+"""Store of objects that take long to make, for later problems and processes, in a folder that may
+be deleted.
 
 A file is named by a hash of all that its content depends on: what it is built by
 (:data:`BUILT_BY`), CasADi's version, the words that say what it is, and the caller's key (robot and
@@ -33,8 +34,8 @@ from jumplab.ocp.problem import Problem
 
 # a problem with terms from elsewhere is not kept, unless it knows the hashes of their expressions
 HOME = ("jumplab.",)
-# modules and rooms that a problem is built by; a test walks the imports of the problems' modules
-# and misses none
+# modules and sub-packages that a problem is built by; a test walks the imports of the problems'
+# modules and misses none
 BUILT_BY = (
     "errors",
     "arguments",
@@ -65,7 +66,7 @@ def in_turn(work: F) -> F:
 
 
 def folder() -> Path | None:
-    """Where files are kept; None if nowhere."""
+    """Folder of the kept files; None if nothing is kept."""
     named = os.environ.get("JUMPLAB_CACHE")
     if named is None:
         return user_cache_path("jumplab")

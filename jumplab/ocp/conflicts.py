@@ -1,4 +1,4 @@
-"""Why there is no plan: terms that are no number, or terms that conflict."""
+"""Reasons for the lack of a plan: terms that are no number, or terms that conflict."""
 
 from __future__ import annotations
 

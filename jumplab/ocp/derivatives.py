@@ -55,7 +55,8 @@ class Part:
         return [t for t in self.terms if not t.is_cost]
 
     def words(self, problem: Problem) -> list:
-        """What its functions depend on besides the expressions: equal words, equal functions.
+        """Words for all that its functions depend on besides the expressions: equal words, equal
+        functions.
 
         The mesh and the values of bounds and weights are data. Phases of one kind may have the same
         words.
@@ -261,8 +262,8 @@ class Formulator:
 
 
 def _column(place: str, term: Term, seen: Sequence) -> ca.SX:
-    """What a term makes of the points that it sees, as a column; refuses whatever is none, by the
-    term's name.
+    """Column (rows, 1) of a term's expression at the points that it sees. Raises
+    :class:`InputError`, with the term's name, if it cannot be evaluated or is no column.
     """
     who = f"term {term.name!r} of {place!r}"
     try:

@@ -1,4 +1,4 @@
-"""Where the variables of a problem stand in the decision vector."""
+"""Indices of a problem's variables in the decision vector."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jumplab.ocp.problem import Phase, Problem
 
 @dataclass(frozen=True)
 class PhaseLayout:
-    """Where the variables of a phase stand in the decision vector.
+    """Indices of a phase's variables in the decision vector.
 
     Entries that the phase shares with others point at theirs.
 

@@ -33,12 +33,12 @@ class Posed:
     rows: tuple[np.ndarray, np.ndarray]
 
     def beyond(self, g: np.ndarray) -> np.ndarray:
-        """How far each row (n_rows,) lies outside its bounds."""
+        """Distance of each row (n_rows,) from its bounds, 0 within them."""
         return np.maximum(np.maximum(self.rows[0] - g, g - self.rows[1]), 0.0)
 
     @property
     def arguments(self) -> dict[str, np.ndarray]:
-        """What CasADi's solvers are called with."""
+        """Arguments with which CasADi's solvers are called."""
         bounds = dict(zip(("lbx", "ubx", "lbg", "ubg"), (*self.box, *self.rows), strict=True))
         return {"x0": self.x0, "p": self.p, **bounds}
 

@@ -41,7 +41,7 @@ PLACES = ("node", "mid", "interval", "start", "end", "problem")
 
 @dataclass
 class Point:
-    """What a term sees: one instant of one phase, in physical units.
+    """Quantities that a term can use: one instant of one phase, in physical units.
 
     Attributes
     ----------
@@ -240,7 +240,7 @@ class Phase:
 
     @property
     def ends(self) -> list[int]:
-        """Where q, v and a end among the variables of a node."""
+        """Ends of q, v and a among the variables of a node."""
         return [k * len(self.coordinates) for k in (1, 2, 3)]
 
     @property

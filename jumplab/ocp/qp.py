@@ -61,7 +61,9 @@ class Block:
         return np.maximum(1.0, np.maximum(np.abs(self.matrix).max(axis=1, initial=0.0), side))
 
     def violation(self, x: np.ndarray) -> np.ndarray:
-        """How far ``x`` (n,) is outside of each row (m,), in the row's own unit."""
+        """Distance of ``x`` (n,) from the bounds of each row (m,), in the row's own unit; 0 within
+        them.
+        """
         value = self.matrix @ x
         return np.maximum(np.maximum(self.low - value, value - self.high), 0.0)
 
@@ -153,8 +155,8 @@ def _column(x: Any, size: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class QpAnswer:
-    """Where a solve ended: ``x`` (n,), iterations, the solver's own word, and whether it says that
-    this is the optimum.
+    """Result of a solve: ``x`` (n,), iterations, the solver's own word, and whether by that word
+    ``x`` is the optimum.
     """
 
     x: np.ndarray
@@ -212,7 +214,7 @@ class Conflict:
 
     # (block, row, amount) that give way in the least total, worst first
     gives: tuple[tuple[str, str, float], ...]
-    # (block, row) of the limits that force them to, dearest first
+    # (block, row) of the limits that force them to, those of the highest price first
     limits: tuple[tuple[str, str], ...]
 
 

@@ -1,5 +1,5 @@
-"""What goes into a solve and what comes out: guesses, solutions at and between the nodes,
-multipliers, statistics.
+"""Input and output of a solve: guesses, solutions at and between the nodes, multipliers,
+statistics.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Multipliers(Shown):
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a solve cost."""
+    """Outcome and effort of a solve."""
 
     iterations: int
     status: str

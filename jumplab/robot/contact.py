@@ -1,5 +1,5 @@
-"""What the ground can do to a foot, and how a foot's points move: numbers that hold for NumPy and
-for CasADi alike.
+"""Limits of contact forces at a foot, and motion of points of a foot: numbers that hold for NumPy
+and for CasADi alike.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def wrench_rows(
     """Rows r (6,) by name, with r @ [force, moment] >= 0 while a foot sticks and does not tip.
 
     The wrench is about a point of the sole, in axes that are turned about the vertical as the foot
-    is. The CoP is at (-m_y, m_x) / f_z from that point. What is None has no rows.
+    is. The CoP is at (-m_y, m_x) / f_z from that point. A limit of None has no rows.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def on_feet(robot: Robot, point: np.ndarray) -> list[Anchor]:
 
 @dataclass(frozen=True, eq=False)
 class PointMotion:
-    """How a point of a link moves, in world axes.
+    """Motion of a point of a link, in world axes.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ def moving(model: pin.Model, data: pin.Data, q: np.ndarray, v: np.ndarray) -> No
 
 
 def point_motion(model: pin.Model, data: pin.Data, anchor: Anchor) -> PointMotion:
-    """How an anchor moves [m, rad, s] in the state that ``data`` is :func:`moving` in."""
+    """Motion of an anchor [m, rad, s] in the state that ``data`` is :func:`moving` in."""
     at = anchor.joint, anchor.placement
     place = data.oMi[anchor.joint] * anchor.placement
     jacobian = pin.getFrameJacobian(model, data, *at, WORLD)

@@ -386,7 +386,9 @@ class Robot(Shown):
 
     @cached_property
     def planar(self) -> bool:
-        """Whether five links in the plane stand for it exactly; if not, it has no three steps."""
+        """Whether five links in the plane describe this robot exactly; if not, three steps cannot
+        plan it.
+        """
         return bool(in_plane(self))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Robots in files of somebody else: the front door names what reads them, since the core knows no
+"""Robots in files of others: the front door names what reads them, since the core knows no
 importer.
 """
 

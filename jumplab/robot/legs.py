@@ -49,7 +49,7 @@ BASE = 6  # columns of the base
 
 @dataclass(frozen=True)
 class Size:
-    """How many times as long and as heavy a robot is as the one on which numbers were found [1].
+    """Ratios of a robot's length and mass to those of the robot on which numbers were found [1].
 
     Under the same gravity, alike robots move alike if times grow by the root of the length
     (Froude's law).
@@ -116,7 +116,7 @@ def leg_columns(robot: Robot) -> list[np.ndarray]:
 
 
 def give_of(robot: Robot) -> np.ndarray:
-    """How readily each column (nv,) moves: joints of legs 1, others and the base 0."""
+    """Weight with which each column (nv,) moves: joints of legs 1, others and the base 0."""
     give = np.zeros(robot.model.nv)
     give[np.concatenate(leg_columns(robot))] = 1.0
     return give

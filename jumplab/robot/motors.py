@@ -1,4 +1,4 @@
-"""What the joints' motors can give at a speed, and what they lose."""
+"""Torque that the joints' motors can give at a speed, and their losses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What the robot can do, as stage 1 needs to know it: leg length, inertia and leg force within
-reach.
+"""Abilities of the robot as stage 1 needs them: leg length, inertia and leg force within reach.
 
 Postures of the sagittal model are sampled (a low-discrepancy sequence, the same every time), those
 outside the joint ranges are dropped, and the extremes over each CoM distance phi give smooth

@@ -158,8 +158,8 @@ def _axis_signs(model: pin.Model, data: pin.Data, role: str, pair) -> list[float
 
 
 def _both(limits: MotorLimits, pair: tuple[str, ...], signs: np.ndarray) -> dict[str, float]:
-    """What both sides can do: the overlap of their ranges, the lower speeds, twice the lower
-    effort; and what they take: armature, friction and damping of both.
+    """Limits that hold for both sides: the overlap of their ranges, the lower speeds, twice the
+    lower effort; and the sums of armature, friction and damping.
     """
     (low, high), (other_low, other_high) = np.sort(
         signs[:, None] * np.stack([limits.lower, limits.upper], -1)

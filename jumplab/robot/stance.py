@@ -12,7 +12,7 @@ from jumplab.robot.contact import WORLD, on_feet
 from jumplab.robot.files import LEG
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, TO_COMPLEX, in_xz
 
-if TYPE_CHECKING:  # a robot is checked by this before anybody gets it
+if TYPE_CHECKING:  # a robot is checked by this before it is returned
     from jumplab.robot.description import Robot
 
 STANCE_ROOM_RAD = 0.04  # plans keep 0.03 off every stop
@@ -92,7 +92,9 @@ def check_stance(robot: Robot) -> np.ndarray:
 
 
 def _other_stance(robot: Robot) -> str:
-    """What of [stance] to change so that the robot can stand, or that nothing tried helps."""
+    """Advice, in a sentence: values of [stance] with which the robot can stand, or that none was
+    found.
+    """
     others = [{"shoulder_rad": 0.0}]
     others += [{"knee_rad": knee, "trunk_pitch_rad": trunk} for knee, trunk in OTHER_STANCES]
     for other in others:
@@ -259,8 +261,8 @@ def standing(robot: Robot) -> np.ndarray:
 
 
 def holding(robot: Robot, q: np.ndarray, friction: float) -> tuple[float, str, float] | None:
-    """What joints need at least to hold a posture ``q`` (nq,) whose soles are on the ground, under
-    the robot's gravity.
+    """Least effort of the joints that holds a posture ``q`` (nq,) whose soles are on the ground,
+    under the robot's gravity.
 
     The ground's forces on the corners of both soles, within friction, are shared out so that the
     joint that uses most of its effort uses as little as can be. Returns that share [1], the joint,

@@ -99,8 +99,8 @@ def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[s
 
 
 def notes(tree: Tree) -> Iterator[str]:
-    """What is left over in a URDF without faults, passed over or mended because no jump would
-    notice.
+    """Notes on a URDF without faults: leftovers that are ignored, and harmless defects that are
+    repaired.
     """
     for element in tree.xml:
         if "xacro" in element.tag:
@@ -372,7 +372,7 @@ def limit_faults(
     """The faults of the limits of one joint that the jump uses, in one sentence, if there are any.
 
     ``given`` as of :func:`wrong_limits`; the sentence advises the ``table`` of the configuration
-    that can tell them.
+    that can hold them.
     """
     if wrong := wrong_limits(tree, joint, given):
         keys = ", ".join(keys_of(wrong))
@@ -422,7 +422,7 @@ def wrong_limits(
 
 
 def _range_fault(lower: float, upper: float, **_: float) -> str:
-    """What is wrong with a range [rad]; "" if nothing is."""
+    """Fault of a range [rad], in words; "" if it has none."""
     span = f"range {lower:g} ... {upper:g} rad is"
     if max(abs(lower), abs(upper)) > MOST_RAD:
         return f"{span} beyond {MOST_RAD:.1f}: degrees or a placeholder; give the real range in rad"

@@ -1,6 +1,4 @@
-"""What ``jumplab robot check`` finds out about a URDF, as one result; above all, whether five links
-describe it.
-"""
+"""Result of ``jumplab robot check`` on a URDF; above all, whether five links describe it."""
 
 from __future__ import annotations
 
@@ -48,7 +46,7 @@ class Checkup:
         return out
 
     def lines(self) -> list[str]:
-        """What else is worth knowing, a line each."""
+        """Further facts about the robot, a line each."""
         r = self.robot
         moving = len(r.joint_names)
         foot = r.foot
@@ -130,7 +128,7 @@ def check_texts(urdf: str, config_text: str, where: str = "") -> None:
 
 def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
     """The checkup of a name or of a path, of a bare URDF or MJCF or of a TOML file; roles are found
-    where no table [source] tells them.
+    where no table [source] names them.
     """
     urdf, folder, config = files_of(robot)
     path = locate(urdf, folder)

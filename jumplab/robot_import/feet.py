@@ -1,6 +1,4 @@
-"""What the feet of a robot stand on: soles from the shapes of their links; and legs that end in
-wheels.
-"""
+"""Contact surfaces of feet: soles from the shapes of their links; and legs that end in wheels."""
 
 from __future__ import annotations
 
@@ -81,7 +79,7 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
 
 
 def thickness(leg_m: float) -> float:
-    """How far above the lowest point of a foot [m] its sole ends."""
+    """Height over the lowest point of a foot up to which its points belong to the sole [m]."""
     return min(SOLE_M, SOLE_SHARE * leg_m)
 
 
@@ -92,7 +90,7 @@ def sole_points(
     origin along the axes ``turn`` (3, 3): those that touch level ground, and corners around
     its shapes, which are farther out where these are round; and the kinds of shapes.
 
-    What is drawn counts where nothing collides.
+    Pictures count where there are no collision shapes.
     """
     axes = pin.SE3(turn, -turn @ tree.pose[foot].translation)
     touching = [np.zeros((0, 3))]

@@ -1,8 +1,8 @@
 """From a published URDF and a person's TOML file to the pair of texts that every stage reads.
 
-A configuration with a table [source] describes somebody else's robot: its URDF is checked, lumped
-and written anew, and so is the configuration. Both results stand on their own, so a result folder
-can carry them.
+A configuration with a table [source] describes a robot in a file of others: its URDF is checked,
+lumped and written anew, and so is the configuration. Both results stand on their own, so a result
+folder can carry them.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def _add_body(
 
 def _add_trunk(robot: ET.Element, body: Body, boxes: Boxes, hip: np.ndarray) -> None:
     """The trunk, with a box for the eye from the hips up; as two links where its principal axes are
-    tilted: PyBullet wants those of its base link upright.
+    tilted: PyBullet needs those of its base link upright.
     """
     centre, size = min(boxes, key=lambda b: b[0][2] - b[1][2] / 2)
     bottom = centre[2] - size[2] / 2

@@ -219,7 +219,7 @@ def _limits(
     tree: Tree, told: dict[str, dict], roles: RoleJoints, joint: str, changed: dict
 ) -> dict[str, float]:
     """The limits of a joint; those that are ``told`` come first; its losses as the file has them,
-    if its motor can bear them.
+    if its motor can overcome them.
     """
     # a joint that is called like a role goes before it
     role = next((r for r, pair in roles.items() if joint in pair and r not in tree.joints), "")
@@ -239,7 +239,7 @@ def _limits(
 
 
 def _motor_fault(limits: dict[str, float]) -> str:
-    """What is wrong with the numbers of a motor, in a sentence; empty if nothing is."""
+    """Fault of a motor's numbers, in a sentence; empty if they have none."""
     speed = limits["velocity"]
     effort = limits["effort"]
     free = limits.get(NO_LOAD, speed)

@@ -1,8 +1,8 @@
 """A robot of MuJoCo's own format (MJCF), by MuJoCo's compiled model, in the description that URDFs
 end in too: links, joints with range, torque, armature and losses, shapes.
 
-What MJCF has and that description has not (loops, tendons, springs, other things in a scene) is
-named in its ``<note>`` elements.
+Parts of an MJCF that such a description lacks (loops, tendons, springs, other things in a scene)
+are named in its ``<note>`` elements.
 """
 
 from __future__ import annotations
@@ -129,8 +129,8 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
 
 
 def _blamed(mesh: mujoco.MjsMesh, sentence: str) -> bool:
-    """Whether MuJoCo complains of the file of a mesh: not there, or no mesh, such as a pointer that
-    Git LFS has not replaced.
+    """Whether MuJoCo's message is about the file of this mesh: it is missing, or it is no mesh (a
+    pointer that Git LFS has not replaced, for example).
     """
     opening = "Error opening file" in sentence and f"{Path(mesh.file).name}'" in sentence
     reading = re.search(r"decoder|MSH file|vertices required", sentence)
@@ -198,7 +198,7 @@ def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
 
 
 class _Motors:
-    """What the actuators of a model do for its degrees of freedom (nv)."""
+    """Effects of a model's actuators on its degrees of freedom (nv)."""
 
     def __init__(self, model: mujoco.MjModel):
         self.torque = np.zeros((model.nv, 2))  # least, greatest [N m]

@@ -1,5 +1,5 @@
-"""What can be found in a URDF that nobody has described yet: roles, soles, and a first TOML file to
-look through.
+"""Roles, soles and a first TOML file to look through, found in a URDF that nobody has described
+yet.
 
 Which joint is which is found from how it moves its links, never from its name.
 """
@@ -71,7 +71,7 @@ Chain = list[Joint]
 
 @dataclass(frozen=True)
 class Roles:
-    """What was found; ``assumed`` are limits that the URDF lacks, as in a table [limits]."""
+    """Roles found in a URDF; ``assumed`` are limits that the URDF lacks, as in a table [limits]."""
 
     trunk: str  # link that carries both legs
     forward: str  # axis of the trunk's frame in the neutral pose, such as "+x"
@@ -207,8 +207,8 @@ class _Finder:
         return [three[2], *still][-1].child
 
     def ahead(self, forward: np.ndarray) -> float:
-        """How far the feet reach ahead of the ankles minus how far behind, half of it [m], if they
-        look along ``forward`` (3,).
+        """Reach of the feet ahead of the ankles minus that behind, halved [m], if they point along
+        ``forward`` (3,).
         """
         out = []
         for three, chain in self.legs:
@@ -223,8 +223,8 @@ class _Finder:
         return max(out)
 
     def middle(self, joints: Sequence[Joint], left: np.ndarray) -> float:
-        """Where the joints' ranges have their middle about ``left`` (3,), -1, 0 or 1: 0 if that
-        is near 0, or if they have no range.
+        """Sign of the middle of the joints' ranges about ``left`` (3,): -1 or 1; 0 if the middle is
+        near 0, or if they have no range.
         """
         sums = []
         for joint in joints:

@@ -231,7 +231,9 @@ def tensor_of(link: ET.Element) -> np.ndarray:
 
 
 def unsolid(matrix: np.ndarray) -> float:
-    """How far an inertia (3, 3) is from the nearest of a solid [kg m^2]; 0 for those."""
+    """Largest entry by which an inertia (3, 3) differs from its nearest physical one [kg m^2]; 0 if
+    it is physical.
+    """
     low, middle, high = np.linalg.eigvalsh(matrix)
     solid = low > 0 and high <= (low + middle) * (1 + TRIANGLE)
     return 0.0 if solid else max(float(np.abs(repaired(matrix) - matrix).max()), 1e-15)
@@ -303,8 +305,8 @@ class Tree:
     """Links and joints of a URDF whose names, connections and inertials have passed the checks.
 
     ``model`` is Pinocchio's with a free base, its joints those that can move, with a frame for each
-    link; ``carrier`` tells which joint moves a link, ``bodies`` which links a joint moves, ``pose``
-    where each is with all joints at 0, in the root's frame [m].
+    link; ``carrier`` has the joint that moves a link, ``bodies`` the links that a joint moves,
+    ``pose`` where each is with all joints at 0, in the root's frame [m].
 
     ``where`` is the name of the file for messages, ``path`` the file itself, near which meshes are
     looked for; ``repair_inertia`` replaces inertias that no solid has by the nearest possible,
@@ -372,7 +374,7 @@ class Tree:
     def holding(self, held: Mapping[str, float], moving: Collection[str]) -> pin.Model:
         """Pinocchio's model whose other joints do not move: they are ``held`` [rad, m], else at 0.
 
-        What floats is not held.
+        Floating joints are not held.
         """
         still = [j for j in self.joints.values() if j.kind in MOVING and j.name not in moving]
         at = np.zeros(self.model.nv)

@@ -1,5 +1,5 @@
-"""What is written: elements of a URDF, numbers with twelve digits, and TOML files from the
-templates of this folder.
+"""Writers of URDF elements, of numbers with twelve digits, and of TOML files from the templates of
+this folder.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def add(parent: ET.Element, tag: str, **values: Any) -> ET.Element:
 
 
 def add_origin(parent: ET.Element, place: pin.SE3) -> None:
-    """Where an element is [m, rad]."""
+    """Add the place of an element [m, rad]."""
     add(parent, "origin", xyz=place.translation, rpy=pin.rpy.matrixToRpy(place.rotation))
 
 

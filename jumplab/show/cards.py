@@ -53,7 +53,7 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.studies.trials import TrialReport
     from jumplab.task import JumpTask
 
-MOST_BINDING = 12  # limits of a record that are shown, the dearest
+MOST_BINDING = 12  # limits of a record that are shown, those of the highest worth
 MOST_PRICES = 14  # and prices
 Card = tuple[Table, Picture | None]
 
@@ -128,7 +128,7 @@ def _of_audit(report: AuditReport) -> Card:
 
 @themed
 def _shares(report: AuditReport) -> Figure | None:
-    """How much of its limit each check uses, the fullest above."""
+    """Bars: the share of its limit that each check uses, the largest above."""
     used = sorted(
         (100 * check.value / check.limit, check.name)
         for check in report.checks
@@ -181,15 +181,15 @@ def _of_record(record: Record) -> Card:
 
 def _of_improved(improved: Improved) -> Card:
     columns = {"number": "number", "unit": "unit", "before": "was", "after": "becomes"}
-    columns |= {"low": "from", "high": "to", "buys": f"buys [{improved.after.unit}]"}
+    columns |= {"low": "from", "high": "to", "buys": f"gain [{improved.after.unit}]"}
     rows = table([vars(x) for x in improved.changes], columns, digits=3)
     return rows, jump_strobe(improved.after.plan.tape, improved.robot)
 
 
 def _of_prices(prices: Prices) -> Card:
     rows = [vars(row) | {"gap": f"{row.gap:.1%}"} for row in prices.rows]
-    columns = {"limit": "limit", "unit": "for one", "price": f"buys [{prices.unit}]"}
-    columns |= {"checked": "moved and sought again", "gap": "differs", "stays": "same limits bind"}
+    columns = {"limit": "limit", "unit": "for one", "price": f"gain [{prices.unit}]"}
+    columns |= {"checked": "with the limit moved", "gap": "differs", "stays": "same limits bind"}
     return table(rows, columns, digits=3), price_bars(prices)
 
 
@@ -207,12 +207,12 @@ def price_bars(prices: Prices) -> Figure:
     for kept, face in ((True, FLIGHT), (False, "white")):
         at = [(size * row.checked * row.step, k) for k, row in enumerate(rows) if row.stays == kept]
         look = dict(linestyle="none", marker="o", markersize=4, color=FLIGHT, zorder=3)
-        label = "sought again" if kept else "sought again, others bind"
+        label = "with the limit moved" if kept else "the same, other limits bind"
         ax.plot(*np.array(at).reshape(-1, 2).T, markerfacecolor=face, label=label, **look)
     ax.axvline(0, **LIMIT_STYLE)
     ax.legend(loc="best")
     unit = "mm" if prices.unit == "m" else "deg"
-    ax.set(xlabel=f"buys [{unit}]", title=f"{prices.robot}: what more of a limit buys")
+    ax.set(xlabel=f"gain [{unit}]", title=f"{prices.robot}: gain from more of each limit")
     return fig
 
 

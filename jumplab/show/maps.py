@@ -92,7 +92,8 @@ def _draw_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: s
         if cell.solved:
             face = tint(colors[cell.limiting], 0.25 + 0.75 * float(np.clip(cell.share, 0, 1)))
             look = dict(ha="center", va="center", fontsize=5.5)
-            look["color"] = "black" if np.mean(face) > 0.3 else "white"
+            luminance = np.dot((0.2126, 0.7152, 0.0722), np.array(face[:3]) ** 2.2)
+            look["color"] = "black" if luminance > 0.2 else "white"
             ax.text(*place, f"{100 * cell.share:.0f}", **look)
         look = dict(facecolor=face, edgecolor="white", linewidth=0.6)
         ax.add_patch(Rectangle(place - size / 2, *size, **look))

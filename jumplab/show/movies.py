@@ -147,7 +147,7 @@ def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Sce
             raise InputError("a movie of a robot needs its record, a tape or a simulation")
         return of, record, scene or Scene.flat()
     if record is not None:
-        raise InputError("a movie of a plan or a simulation takes no other record; leave it away")
+        raise InputError("a movie of a plan or a simulation takes no other record; leave it out")
     if isinstance(of, JumpPlan):
         return of.robot, of.tape, scene or Scene.of_plan(of.summary, of.robot)
     if of.robot is None:
@@ -156,8 +156,8 @@ def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Sce
 
 
 def camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
-    """Where the camera looks (n, 3) [m] along the way, and its distance [m]; it stands still unless
-    the jump is long.
+    """Points (n, 3) [m] at which the camera looks along the way, and its distance [m]; it stands
+    still unless the jump is long.
     """
     base = way.joints[:, 0, :2]
     height = way.joints[..., 2].max(axis=1)  # of the highest joint

@@ -60,7 +60,7 @@ class Part:
     """A surface that moves with a joint."""
 
     joint: int
-    kind: str  # "trunk" and "limb", whose colour tells the phase, or "rest"
+    kind: str  # "trunk" and "limb", whose colour shows the phase, or "rest"
     points: np.ndarray  # (n, 3) in the joint's frame [m]
     triangles: np.ndarray  # (m, 3) rows of ``points``
     faceted: bool = False  # triangles are seen as flat; else they are parts of a round surface
@@ -78,7 +78,7 @@ def placed(points: np.ndarray, place: pin.SE3) -> np.ndarray:
 
 
 class Trace(NamedTuple):
-    """Where a robot is at N states."""
+    """Places of a robot's parts at N states."""
 
     # (N, njoints - 1, 7) of the joints, the base first: x y z [m], then the quaternion x y z w
     joints: np.ndarray
@@ -86,7 +86,7 @@ class Trace(NamedTuple):
     com: np.ndarray  # (N, 3) [m]
 
     def toes(self, robot: Robot) -> np.ndarray:
-        """How far ahead the toes are (N,), the mean of both [m]."""
+        """Places of the toes ahead (N,), the mean of both [m]."""
         return (self.feet @ [*robot.foot.tip, 1.0])[..., 0].mean(axis=1)
 
 
@@ -118,8 +118,8 @@ def pressure_points(
 
 
 def ground_forces(whole: Motion, rate_hz: float, way: Trace, scene: Scene) -> np.ndarray | None:
-    """Where the ground presses on each foot, and with which force (N, 2, 6) [m, N], at ``rate_hz``
-    along the ``way``.
+    """Centre of pressure and ground force of each foot (N, 2, 6) [m, N], at ``rate_hz`` along the
+    ``way``.
 
     NaN where it does not; None if nothing is known of it. The force is the mean from frame to
     frame, as that of an impact depends on the engine's step.

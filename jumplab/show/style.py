@@ -294,7 +294,7 @@ def made_with() -> str:
 
 
 def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -> str:
-    """What NAME.txt says: caption, target (or targets), robot and versions, one line each."""
+    """Text of NAME.txt: caption, target (or targets), robot and versions, one line each."""
     lines = [caption.strip() or "No caption."]
     tasks = [task] if isinstance(task, JumpTask) else list(task or ())
     if tasks:

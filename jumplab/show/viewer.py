@@ -1,7 +1,7 @@
 """The 3-D page of a jump: what it shows as data, its player and meshcat's viewer in one file that
 refers to nothing outside itself.
 
-What is computed stands here, how it is drawn in ``player.js``.
+This module computes the data; ``player.js`` draws them.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def _ground(scene: Scene, span: tuple[float, float]) -> tuple[list[dict[str, Any
 # the motion
 # ----------------------------------------------------------------------------------------------
 def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, Any]:
-    """What the page plays of a motion that goes this way."""
+    """Data with which the page plays a motion that goes this way."""
     motion = whole.every(FPS)
     forces = ground_forces(whole, FPS, way, scene)
     words = [_words(*row) for row in zip(motion.phase, motion.contact, strict=True)]

@@ -39,7 +39,7 @@ def waiting(out: TextIO, head: str = "") -> Iterator[None]:
 
 
 def on_terminal(command: str) -> contextlib.AbstractContextManager:
-    """What a ``command`` is doing, on stderr if that is a terminal."""
+    """Show the progress of a ``command`` on stderr, if that is a terminal."""
     out = sys.stderr
     return waiting(out, f"jumplab {command}: ") if out.isatty() else contextlib.nullcontext()
 
@@ -63,7 +63,7 @@ class _UnderCell:
 
 
 def show_waiting() -> None:
-    """Show such a line from here on, if this is an open notebook that somebody looks at."""
+    """Show such a line from here on, if this is a notebook that is open in an editor."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     open_notebook = hasattr(shell, "kernel") and os.environ.get("JPY_SESSION_NAME") != ""
     if open_notebook and not hasattr(shell, "_jumplab_waiting"):

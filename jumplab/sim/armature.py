@@ -73,8 +73,8 @@ class Armature:
         """Generalised forces (N - 1, nv) that acted because of the delay, from a log (N, nq), (N,
         nv) of all steps.
 
-        What is given back in a step, less what is due in it: over any time that is what is due at
-        its two ends.
+        The torque given back in a step, less the one due in it: summed over any time, this is the
+        difference of those due at its two ends.
         """
         spins = np.array([self._spins(*row) for row in zip(q, v, strict=True)])
         changes = (np.diff(x, axis=0) / STEP_S for x in (spins, v[:, 6:]))

@@ -24,7 +24,7 @@ from jumplab.sim.scene import REACH_M, Contacts
 
 @dataclass(frozen=True)
 class Contact:
-    """How contacts are solved: options of PyBullet's engine, which has defaults of its own."""
+    """Contact model: options of PyBullet's engine, which has defaults of its own."""
 
     options: dict[str, float] = field(default_factory=dict)
     substeps: int = 1  # in one step of the simulation
@@ -93,8 +93,7 @@ def base_to_bullet(
     [rad/s] of its CoM.
 
     ``q`` (7,), ``v`` (6,) : pose of the link frame and twist in its own axes, further entries
-    unread; ``lever`` (3,) : CoM of the base link in its link frame [m]. What is returned is in
-    world axes.
+    unread; ``lever`` (3,) : CoM of the base link in its link frame [m]. Results are in world axes.
     """
     attitude = rotation(q[3:7])
     velocity = attitude @ (v[:3] + pin.skew(v[3:6]) @ lever)
@@ -218,8 +217,9 @@ class BulletEngine(Engine):
         return bool(self._bullet.getContactPoints(bodyA=self._body, bodyB=self._body))
 
     def kept(self) -> Kept:
-        """What the engine has; damping, armature and friction of the motors come in :meth:`step`,
-        and the inertia that links are lent is given back there."""
+        """Quantities that the engine really has; damping, armature and friction of the motors come
+        in :meth:`step`, and the inertia that links are lent is given back there.
+        """
         rows = {
             link: self._bullet.getDynamicsInfo(self._body, i)
             for i, link in enumerate(self.links, -1)

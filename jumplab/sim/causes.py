@@ -1,4 +1,4 @@
-"""Why a jump failed: what its log shows first, and when."""
+"""Causes of a failed jump: the first signs in its log, and their times."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 the engine.
 
 The strongest one asks mechanics: the logged motion, torques and foot forces must obey the robot's
-equations of motion. They leave no room for a hand that holds the base, a motor that gives more than
+equations of motion. They exclude a hand that holds the base, a motor that gives more than
 it says, or a velocity set.
 """
 
@@ -81,7 +81,7 @@ def check(result: SimulationResult) -> tuple[Finding, ...]:
 
 
 def _largest_jump(result: SimulationResult) -> float:
-    """How far a state is from where its velocities lead [m, rad].
+    """Largest distance of a state from the one to which the velocities before it lead [m, rad].
 
     Within a step of n semi-implicit ones, the velocity that moves the robot lies about v + (1 + 1 /
     n) / 2 dv, and further away only by what the logged forces of the ground may do to it within the
@@ -173,7 +173,7 @@ def unexplained(result: SimulationResult) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rubbed(left: np.ndarray, result: SimulationResult) -> np.ndarray:
-    """What the motors' friction does not explain of joint torques (N - 1, nv - 6).
+    """Part of joint torques (N - 1, nv - 6) that the motors' friction does not explain.
 
     A joint that hardly moves within a step, or turns back, is held by anything up to its dry
     friction.
@@ -295,8 +295,8 @@ def friction_used(force: np.ndarray, place: np.ndarray, ground: Scene) -> np.nda
 def _outside(
     foot: Foot, origin: np.ndarray, place: np.ndarray, wrench: np.ndarray, deep: Any
 ) -> np.ndarray:
-    """How far (k,) the CoP of each ``wrench`` (k, 6) about ``origin`` (k, 4, 4) lies outside the
-    sole of a foot at ``place`` (k, 4, 4) [m].
+    """Distance (k,) by which the CoP of each ``wrench`` (k, 6) about ``origin`` (k, 4, 4) lies
+    outside the sole of a foot at ``place`` (k, 4, 4) [m]; negative within.
 
     The CoP is in the plane of the sole, or ``deep`` (k,) [m] above: ground that has given way
     presses on its sides as well.

@@ -1,4 +1,4 @@
-"""What the simulation wants of a physics engine.
+"""Interface of physics engines, as the simulation needs it.
 
 A further engine is a class with :class:`Engine`'s methods, a line in :data:`jumplab.sim.ENGINES`,
 and passes ``test_sim_world.py``; all else knows no engine.
@@ -29,7 +29,7 @@ TANGLES = 20  # postures tried until links are in each other; for a humanoid the
 
 
 class Kept(NamedTuple):
-    """What an engine has, which need not be what it was told."""
+    """Quantities that an engine really has, which may differ from those that it was given."""
 
     inertials: dict[str, pin.Inertia]  # of every link, in its frame
     # between every link that can touch, and ground of 1 [1]
@@ -141,7 +141,7 @@ class Engine(ABC):
 
     @abstractmethod
     def kept(self) -> Kept:
-        """What the engine has."""
+        """Quantities that the engine really has."""
 
     @abstractmethod
     def state(self) -> tuple[np.ndarray, np.ndarray]:
@@ -167,7 +167,7 @@ class Engine(ABC):
 
     @abstractmethod
     def contacts(self) -> Contacts:
-        """What touched, and how hard, in the last step."""
+        """Contacts of the last step, and their forces."""
 
     @abstractmethod
     def _sole_points(self) -> np.ndarray:
@@ -184,10 +184,11 @@ class Engine(ABC):
         return mass * gravity / soft_m, 2 * mass * np.sqrt(gravity / soft_m)
 
     def read_back(self) -> dict[str, Any]:
-        """What the engine has, as plain data: effective friction of each foot on each block, the
-        largest error of its bodies, each with what is fixed to it (mass [kg], times place of its
-        centre [kg m], inertia about the joint [kg m^2]), whether links collide, how far beyond the
-        stated sole a foot ever touched [m] ..."""
+        """Quantities that the engine really has, as plain data: effective friction of each foot on
+        each block, the largest error of its bodies, each with the links that are fixed to it (mass
+        [kg], times place of its centre [kg m], inertia about the joint [kg m^2]), whether links
+        collide, the largest distance beyond the stated sole at which a foot touched [m] ...
+        """
         kept = self.kept()
         model = self.robot.model
         bodies = [pin.Inertia.Zero() for _ in model.inertias]
@@ -226,7 +227,7 @@ class Engine(ABC):
             raise JumplabError(f"{weight}, Pinocchio's {self.robot.total_mass:.4f} kg")
 
     def _beyond_sole(self) -> float:
-        """How far beyond the stated sole a contact of a foot ever lay [m]."""
+        """Largest distance beyond the stated sole at which a contact of a foot ever lay [m]."""
         if not self._pressed:
             return 0.0
         foot = self.robot.foot

@@ -1,4 +1,4 @@
-"""What becomes of a commanded torque once it arrives: each motor delivers as well as it can."""
+"""Motors: each delivers a commanded torque as well as it can."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ class Motors:
         self._gain = np.array([gain.get(name, 1.0) for name in robot.joint_names])
 
     def deliver(self, tau: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """What becomes of ``tau`` (nv - 6,) [N m] at true joint rates ``rate``."""
+        """Torque that is delivered for the commanded ``tau`` (nv - 6,) [N m] at true joint rates
+        ``rate``.
+        """
         left = max(1 - self._sag_per_w * self._drawn_w, LEAST_VOLTAGE)
         low, high = self._limits.range(rate / left)
         given = np.minimum(np.maximum(self._gain * tau, low), high)

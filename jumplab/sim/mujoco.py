@@ -21,7 +21,9 @@ mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
 
 @dataclass(frozen=True)
 class Contact:
-    """How contacts give way and stick; defaults are MuJoCo's own, with its names in brackets."""
+    """Contact model: how far contacts give way, and how they stick; defaults are MuJoCo's own, with
+    its names in brackets.
+    """
 
     # [s] a penetration fades (solref); of the engine's steps it takes two, with feet four
     time_s: float = 0.02
@@ -203,7 +205,9 @@ class MujocoEngine(Engine):
         self._data.qvel[:3] = rotation(q[3:7]) @ v[:3]
 
     def kept(self) -> Kept:
-        """What the engine has; ``ground_friction`` is what a block makes of a foot's."""
+        """Quantities that the engine really has; ``ground_friction`` is the factor by which a block
+        changes that of a foot.
+        """
         has = self._model
         quaternions = has.body_iquat[:, [1, 2, 3, 0]]
         rows = zip(has.body_mass, has.body_ipos, quaternions, has.body_inertia, strict=True)

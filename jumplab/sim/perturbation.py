@@ -1,5 +1,5 @@
-"""How the simulated robot differs from the planned one; the paper's own differs "slightly" too
-(Sec. VI-B).
+"""Differences between the simulated robot and the planned one; the paper's own differs "slightly"
+too (Sec. VI-B).
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ def _up_to(default: Any, most: float, words: str, unit: str = "", least: float =
 
 @dataclass(frozen=True)
 class Ranges:
-    """How far robots and worlds differ: the uniform draws of :meth:`Perturbation.draw`, every link
-    and joint by itself.
+    """Largest differences of robots and worlds: the uniform draws of :meth:`Perturbation.draw`,
+    every link and joint by itself.
 
-    A pair is drawn from ... to, a single number is the half-width around nothing. What is beyond
-    the last number of a field's declaration is refused with an :class:`InputError`. From the
-    payload on they are off unless they are asked for.
+    A pair is drawn from ... to, a single number is the half-width around nothing. Values beyond the
+    last number of a field's declaration are refused with an :class:`InputError`. From the payload
+    on they are off unless they are asked for.
     """
 
     mass: float = _up_to(0.05, 0.2, "masses", "%")  # [1], relative
@@ -129,8 +129,8 @@ class Ranges:
 
     @property
     def known_delay_s(self) -> float:
-        """What a laboratory measures beforehand [s]: the middle of the delays. What a robot is off
-        it, nobody knows.
+        """Delay that a laboratory measures beforehand [s]: the middle of the range. The difference
+        of a robot from it is not known.
         """
         return sum(self.delay_s) / 2
 

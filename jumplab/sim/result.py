@@ -1,5 +1,5 @@
-"""What a simulated jump leaves behind: logs at 1 kHz, numbers measured from them, and what its
-checks found. :func:`record` makes it from what was noted step by step.
+"""Result of a simulated jump: logs at 1 kHz, numbers measured from them, and its checks.
+:func:`record` makes it from the records of every step.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ class SimulationResult(Shown, Named):
 
     @property
     def reason(self) -> str:
-        """Why the verdict is what it is."""
+        """Reason for the verdict."""
         return self.metrics.reason
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -222,8 +222,8 @@ class SimulationResult(Shown, Named):
     @classmethod
     @checked
     def load(cls, folder: str | Path, robot: Robot) -> SimulationResult | None:
-        """What :meth:`save` wrote into ``folder``; None if it holds no simulation. Raises
-        :class:`InputError` if a file is damaged, or the simulation is not one of ``robot``.
+        """Read the simulation that :meth:`save` wrote into ``folder``; None if there is none.
+        Raises :class:`InputError` if a file is damaged, or the simulation is not one of ``robot``.
         """
         if not (Path(folder) / SIMULATION_NAME).is_file():
             return None
@@ -334,7 +334,7 @@ def record(
 
 @dataclass
 class _Jump:
-    """What is measured of a run: names and values of :class:`Metrics`. What it has ``flown`` are
+    """Measurements of a run: names and values of :class:`Metrics`. The flights in ``flown`` are
     rows of its log.
     """
 
@@ -463,7 +463,7 @@ class _Jump:
         return self.run.link_names[int(np.argmax(self.run.stray[row]))]
 
     def _unfinished(self, fallen: np.ndarray) -> str:
-        """Why there is no last touchdown; the robot has ``fallen`` in these rows."""
+        """Reason why there is no last touchdown; the robot has ``fallen`` in these rows."""
         if not self.flown:
             return "the feet never left the ground"
         if self.flights == 1:
@@ -498,7 +498,9 @@ class _Jump:
 
 
 def motors_spent(motors: MotorLimits, tau: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Where torques ``tau`` (N, n) [N m] at ``rates`` (N, n) [rad/s] are all that motors have."""
+    """Whether torques ``tau`` (N, n) [N m] at ``rates`` (N, n) [rad/s] are at the motors' limits,
+    entry by entry.
+    """
     low, high = motors.range(rates)
     return (np.abs(tau) >= SATURATED * np.where(tau > 0, high, -low)) & (tau != 0)
 

@@ -1,4 +1,4 @@
-"""What the robot stands and lands on, boxes with even tops and real edges; and what it touches."""
+"""Ground to stand and to land on, boxes with even tops and real edges; and contacts with it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ REACH_M = 20.0  # half-size of "endless" ground, far beyond any jump
 THICKNESS_M = 1.0  # deeper than any contact can push a foot in one step
 UNEVEN_M = 5e-3  # by how much the ground may miss a corner of a sole at the start
 STRAIGHT_RAD = 1e-9  # a heading that differs from +x by rounding alone is straight ahead
-# least room between the soles at the start and at the landing, where the ground of one is to differ
+# least distance between the soles at the start and at the landing, where the ground of one is to
+# differ
 GAP_M = 0.02
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """What touched in one step."""
+    """Contacts of the robot in one step."""
 
     # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
     wrench: np.ndarray
@@ -216,8 +217,8 @@ class Scene:
         return normals[number] @ about_vertical(self.along_rad).T
 
     def depth_of(self, points: np.ndarray, soft: bool = True) -> np.ndarray:
-        """How deep (...) the lowest of each k ``points`` (..., k, 3) of the world lies in the
-        ground, in ``soft`` ground alone if wanted [m].
+        """Depth (...) below the ground's surface of the lowest of k ``points`` (..., k, 3) of the
+        world [m]; in ``soft`` ground alone, where that is asked.
         """
         number, top = self._highest(self.along(points))
         deep = top - points[..., 2]
@@ -270,8 +271,8 @@ class Scene:
         return replace(scene, name=f"{scene.name}, landing moved", blocks=tuple(blocks))
 
     def height_of(self, q: np.ndarray, robot: Robot, planned: Scene) -> float:
-        """How much higher the ground is than the blocks of the ``planned`` scene, under the soles
-        of ``q`` [m].
+        """Height of the ground over the blocks of the ``planned`` scene, under the soles of ``q``
+        [m].
         """
         soles = Gauge(robot).soles(shaped(q, (robot.model.nq,), "q"))
         real, height = self.below(soles)

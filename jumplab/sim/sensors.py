@@ -1,4 +1,4 @@
-"""What the robot's sensors tell of the true state, and what its controllers make of that."""
+"""Sensors of the robot, with their errors, and the controllers' view of its state."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Sensors:
 
 
 class Perception:
-    """What the controllers are told: the truth if no sensor errs, otherwise the estimate, see
+    """State as the controllers see it: the true one if no sensor errs, otherwise the estimate, see
     :class:`Estimator`.
     """
 
@@ -86,7 +86,7 @@ class Perception:
         return State(q, v, reading.foot_wrench)
 
     def to_json(self) -> dict:
-        """What the settings of a result say."""
+        """Kind of the state and its worst errors, for the settings of a result."""
         if self._estimator is None:
             return {"state": "true"}
         tilt, speed = self._worst.tolist()

@@ -25,7 +25,7 @@ Look = Callable[[Problem, str, Term, str], str]  # see :func:`jumplab.ocp.change
 
 @dataclass(frozen=True)
 class StageChanges:
-    """What is changed about one stage.
+    """Changes to one stage.
 
     Attributes
     ----------

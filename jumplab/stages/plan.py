@@ -247,7 +247,9 @@ def make_tape(body: WholeBodyPlan, srmp: SrmpPlan | None = None) -> Tape:
 # what is said of it
 # ----------------------------------------------------------------------------------------------
 def planned(tape: Tape) -> dict[str, float]:
-    """Where the motion of a tape goes; to the side only if it is not one in the plane."""
+    """Distance, rise and other measures of a tape's motion; also to the side, unless the motion is
+    in the plane.
+    """
     extra = tape.extra
     height = extra["com"][:, 2]
     flights = [height[rows] for rows in tape.flights] or [height]

@@ -186,7 +186,7 @@ class Planner(Shown):
         return self.stage("direct", flip=bool(task.rotation_rad)).program(task, weights)
 
     def _joint_changes(self, asked: StageChanges = StageChanges()) -> StageChanges:
-        """What is changed about stage 2, with the weights that one plan is ``asked`` for."""
+        """Changes to stage 2, with the weights that one plan is ``asked`` for."""
         changes = self.changes["joint qp"]
         return replace(changes, weights={**changes.weights, **asked.weights})
 
@@ -241,7 +241,7 @@ class Planner(Shown):
         return method
 
     def _of_first_stages(self, asked: Mapping[str, StageChanges]) -> list[str]:
-        """What is changed about stages that the direct method leaves out, in words."""
+        """Changes to stages that the direct method leaves out, in words."""
         changed = [f"{s!r}" for s in FIRST_STAGES if self.changes[s] or asked[s]]
         return changed + ["the settings of 'srmp'"] * (self._given[SrmpSettings] is not None)
 

@@ -1,6 +1,4 @@
-"""What a motion of the full robot is in the plane: link angles, the toes' path, and planar
-quantities.
-"""
+"""Planar view of a motion of the full robot: link angles, the toes' path, and planar quantities."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What to ask for instead of a jump that is refused: an easier one that has just been planned, and
-audited clean.
+"""Advice for a jump that is refused: an easier one that has just been planned, and passed its
+audit.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def advised(
     method: str = USUAL,
     spent_s: float | None = None,
 ) -> JumplabError:
-    """The ``refusal`` again (same type, same fields), ending with an easier target that has a clean
-    plan, or saying which were tried.
+    """The ``refusal`` again (same type, same fields), ending with an easier target that has a plan
+    which passes its audit, or saying which were tried.
 
     Each target that is tried is milder than the one before, in one of its numbers. ``spent_s`` is
     the processor time [s] after which planning was given up, if it was.
@@ -124,7 +124,7 @@ def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str
 
 
 def refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | None:
-    """Why a target has no plan that passes its audit; None if it has one."""
+    """Reason why a target has no plan that passes its audit; None if it has one."""
     try:
         plan = planner.plan(task, method)
     except JumplabError as e:
@@ -133,7 +133,7 @@ def refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | Non
 
 
 def words(task: JumpTask, easier: JumpTask) -> str:
-    """What is different about an easier target [m, deg], as a person would say it."""
+    """Differences of an easier target [m, deg], in a person's words."""
     changes = [
         f"a {name.removesuffix('_m')} of {getattr(easier, name):g} m"
         for name in ("distance_m", "height_m", "platform_m", "side_m")

@@ -250,7 +250,7 @@ class Atlas:
 
 
 def key_of_plans(body: WholeBodyPlanner) -> str:
-    """What plans of a direct planner are made of."""
+    """Fingerprint of all that decides plans of a direct planner."""
     problem = body.program(AHEAD).nlp.problem
     words = [part.words(problem) for part in parts(problem)]
     mesh = sorted(body.mesh.intervals().items())

@@ -1,8 +1,8 @@
 """Do two physics agree on a plan? Its audit, then every engine in two modes: the robot as planned,
 and perturbed ones; and the robot as planned on contacts as each engine has them by default.
 
-Engines differ in how feet meet the ground. What a jump owes to that, and not to its plan, shows
-where they are apart.
+Engines differ in how feet meet the ground. Their differences show which part of a jump depends on
+that, and not on its plan.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LIMITS = TABLE["limits"]
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is compared: its name and unit, a field of a jump's metrics, one of :data:`LIMITS`."""
+    """Quantity to compare: name and unit, a field of a jump's metrics, one of :data:`LIMITS`."""
 
     name: str
     unit: str
@@ -79,7 +79,7 @@ COLUMNS |= {"median": "robots, median", "largest": "largest"}
 
 @dataclass(frozen=True)
 class ModeReport:
-    """What the engines made of the plan in one mode of playback."""
+    """Results of the engines for the plan in one mode of playback."""
 
     mode: str
     # by engine: the robot as planned, exact sensors, no correction in the air
@@ -89,7 +89,7 @@ class ModeReport:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """What is compared."""
+        """Quantities to compare."""
         return QUANTITIES if self.in_plane else (*QUANTITIES, *AWAY)
 
     @cached_property
@@ -129,17 +129,17 @@ class ModeReport:
 
     @property
     def same(self) -> int:
-        """How many perturbed robots stand in all engines, or fall in all."""
+        """Number of perturbed robots that stand in all engines, or fall in all."""
         return len(self.pairs) - len(self.unlike)
 
     @property
     def landed(self) -> dict[str, int]:
-        """How many perturbed robots land, by engine."""
+        """Number of perturbed robots that land, by engine."""
         return {name: sum(pair[name].landed for pair in self.pairs) for name in self.planned}
 
     @property
     def failures(self) -> list[str]:
-        """Why the engines do not agree on a landing, in sentences."""
+        """Reasons why the engines do not agree on a landing, in sentences."""
         sentences = [
             f"{engine} does not land it: {t.reason}"
             for engine, t in self.planned.items()
@@ -209,7 +209,7 @@ class Certificate:
 
     @property
     def failures(self) -> list[str]:
-        """What stands against the plan, in sentences; none if it is certified."""
+        """Reasons against a certificate for the plan, in sentences; none if it is certified."""
         checks = [f"the plan fails the audit's check {check.name}" for check in self.audit.failed]
         falls = [
             f"usual contact: {engine} does not land it: {trial.reason}"
@@ -265,7 +265,7 @@ def certify(
     Parameters
     ----------
     n, seed, jobs, progress : as of :func:`jumplab.studies.trials.run_trials`. Finished simulations
-        are kept in ``trials.jsonl``: a stopped run goes on from there.
+        are kept in ``trials.jsonl``: a stopped run resumes from there.
     page : makes the text of ``certificate.html``, written with ``certificate.json``, if there is to
         be one.
 

@@ -81,7 +81,7 @@ def make_clips(
     """Make the library of a robot in the folder ``out``: per clip a folder (plan, simulation,
     clip), and an index.
 
-    A clip passes if its plan is clean in the audit, and lands in every engine, all of them within
+    A clip passes if its plan passes the audit, and lands in every engine, all of them within
     the limits of :data:`.certify.LIMITS` of each other. It shows the simulated jump, from stand to
     stand, in the default engine.
 

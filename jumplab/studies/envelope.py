@@ -1,7 +1,7 @@
 """The jumps that a robot can do: a map over two numbers of the target, each cell a plan by the
 direct method, audited.
 
-Every finished cell is a line of ``cells.jsonl``, so that an interrupted map goes on where it
+Every finished cell is a line of ``cells.jsonl``, so that an interrupted map resumes where it
 stopped.
 """
 

@@ -48,15 +48,15 @@ COLUMNS = (
 
 
 def role_of(robot: Robot, joint: str) -> str:
-    """What a joint does in words, on either side: its role, or its name if it has none."""
+    """Word for a joint on either side: its role, or its name if it has none."""
     roles = {name: role for role, pair in robot.joints.items() for name in pair}
     word = roles.get(joint, joint).removeprefix("left_").removeprefix("right_")
     return word.replace("_", " ")
 
 
 def most_used(report: AuditReport, robot: Robot) -> tuple[str, float]:
-    """What a plan uses most of what its robot has, torque at its speed, speed or friction, and the
-    share of it [1].
+    """The ability of its robot that a plan uses most, torque at its speed, speed or friction, and
+    the used share of it [1].
 
     A joint with a role is named by it.
     """

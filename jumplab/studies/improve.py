@@ -81,7 +81,7 @@ class Improved(Shown):
         return self.after.plan.robot
 
     def line(self) -> str:
-        """What it buys, by which changes, and what ends the new record."""
+        """Gain, the changes that make it, and the limits that end the new record, in one line."""
         old, new = self.before, self.after
         made = [
             f"{x.number} {x.before:.3g} -> {x.after:.3g}{x.unit and ' ' + x.unit}"
@@ -156,7 +156,7 @@ def _climbed(record: Record, numbers: Free, budget: int) -> tuple[np.ndarray, np
 
 
 def _price(pricer: Any, record: Record, numbers: Free, shares: np.ndarray, k: int) -> float:
-    """What a number buys per share of it [m, rad]."""
+    """Gain of the record per share of a number [m, rad]."""
     for step in (PROBE, -PROBE):
         moved = shares.copy()
         moved[k] *= 1 + step
@@ -169,7 +169,7 @@ def _price(pricer: Any, record: Record, numbers: Free, shares: np.ndarray, k: in
 # the numbers
 # ----------------------------------------------------------------------------------------------
 def _numbers(robot: Robot, free: Mapping[str, Any]) -> Free:
-    """What may change; refuses (:class:`InputError`) what is no number of the robot."""
+    """Numbers that may change; raises :class:`InputError` for one that the robot does not have."""
     kinds = ("gear", *PARTS, "mass_kg")
     if not free or set(free) - set(kinds):
         raise InputError(

@@ -1,5 +1,5 @@
-"""Where jumps begin to fail: for each disturbance, the largest size at which at least 95 % of the
-robots land.
+"""Sizes of disturbances at which jumps begin to fail: for each one, the largest size at which at
+least 95 % of the robots land.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _size(name: str, share: float) -> float:
 
 @dataclass(frozen=True)
 class Margin:
-    """How much of one disturbance, or of several together, a plan tolerates."""
+    """Margin of a plan against one disturbance, or against several together."""
 
     names: str  # as in :func:`ranges_at`
     reaim: bool  # whether the legs were re-aimed
@@ -106,7 +106,7 @@ class MarginReport(Shown):
     feedback: bool = False  # whether the launch was corrected
 
     def line(self) -> str:
-        """How many disturbances are borne to their limits."""
+        """Number of disturbances that are tolerated up to the largest size tried."""
         whole = sum(m.share == 1 for m in self.margins)
         ways = ", one recovery step allowed" * self.step + ", launch corrected" * self.feedback
         return (

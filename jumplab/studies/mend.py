@@ -71,7 +71,7 @@ NEAR = 1e-3  # of a limit's size: it binds
 
 @dataclass(frozen=True, repr=False)
 class Mended(Shown):
-    """What mending a clip ended in.
+    """Result of mending a clip.
 
     Attributes
     ----------
@@ -261,7 +261,7 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
 
 
 def _standing_s(before: ClipReport, event_s: float, way: int) -> float:
-    """How much of the standing before (``way`` -1) or after an event to keep [s]."""
+    """Part of the standing before (``way`` -1) or after an event that is kept [s]."""
     rates = np.sqrt((before.tape.v[:, 6:] ** 2).mean(axis=1))
     kept = np.arange(AROUND_S[0], AROUND_S[1] + 1e-9, 1 / before.clip.fps)
     return float(kept[np.argmin(np.interp(event_s + way * kept, before.clip.t, rates) + kept)])
@@ -449,7 +449,7 @@ class Draft:
         return np.stack([np.interp(at, self.clip.t, x) for x in self.charts.T], axis=-1)
 
     def _bends(self, chart: np.ndarray) -> list[float]:
-        """How far the knees of a chart are bent, left and right [rad]."""
+        """Bends of the knees of a chart, left and right [rad]."""
         return [sign * chart[BASE + k] + angle for k, sign, angle in self.body.knees]
 
     def _lower(self, chart: np.ndarray, k: int, i: int) -> float:

@@ -1,5 +1,5 @@
-"""What more of each limit would buy, at a record: prices by multipliers, each checked by a record
-with the limit moved.
+"""Gain of a record per unit of each limit: prices by multipliers, each checked by a record with the
+limit moved.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FRICTION_STEP = 0.005
 
 @dataclass(frozen=True)
 class Price:
-    """What more of a limit buys.
+    """Gain of a record per unit of one limit.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Price:
 
 @dataclass(frozen=True, repr=False)
 class Prices(Shown):
-    """The prices of a record, dearest first."""
+    """The prices of a record, the highest first."""
 
     what: str
     robot: str
@@ -85,7 +85,7 @@ class Prices(Shown):
     rows: tuple[Price, ...]
 
     def line(self) -> str:
-        """How many there are, and how well they are confirmed."""
+        """Number of prices, and their agreement with the checks."""
         kept = [row.gap for row in self.rows if row.stays]
         return (
             f"{self.robot}, {self.what}: {len(self.rows)} prices; of {len(kept)} limits, which may "
@@ -146,7 +146,7 @@ def _both(program: Program, joint: str) -> dict[str, int]:
 
 
 class Pricer:
-    """What a record gains where numbers of its program change, by multipliers.
+    """Gains of a record where numbers of its program change, by multipliers.
 
     They say what a limit is worth in the sum of record and effort; how that grows with the worth of
     the record alone is what it buys. So two records of different worth make a price, with the
@@ -167,7 +167,7 @@ class Pricer:
         self.by = _sought(program, solved) / task.gravity if rises else 1.0
 
     def reached(self, solved: Solved) -> float:
-        """What is sought, to first order about the record [m, rad]."""
+        """The number that is sought, to first order about the record [m, rad]."""
         return self.by * _sought(self.program, solved)
 
     def buys(self, moved: Program) -> float:
@@ -208,5 +208,5 @@ def _active(program: Program, task: JumpTask, solved: Solved) -> set[tuple]:
 
 
 def _sought(program: Program, solved: Solved) -> float:
-    """What is sought, in the words of the program."""
+    """The number that is sought, in the words of the program."""
     return next(iter(solved.solution.phases.values())).constants[program.sought[0]]

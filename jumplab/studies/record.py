@@ -1,8 +1,8 @@
-"""How far a robot can go in one number of the target, what ends it, and what more of each limit
-would buy.
+"""Records of a robot in one number of the target, the limits that end them, and the gain per unit
+of each limit.
 
-The number is an unknown of the whole-body program and as large as can be. A local solver speaks,
-from several easy jumps: a record is what it found "at least".
+The number is an unknown of the whole-body program and as large as can be. The solver is local and
+begins with several easy jumps: a record is a lower bound.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ EASY = {
 # shares of the best that they led to, whose own plans, of least effort, are the next starts
 CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
-# shares of it, of which the first clean one counts
+# shares of it, of which the first that passes its audit counts
 STEPS_BACK = 1.0, 0.99, 0.98, 0.96, 0.93, 0.9, 0.85, 0.8, 0.7
 LESS = 0.05  # of the share of a record that is played next, where a robot falls
 TRIED = 5  # shares that are played
@@ -91,7 +91,7 @@ class Record(Shown):
         too) [m]; inf where none is known. See :func:`.bounds.most`.
     plan, audit : a plan at the record, and its audit.
     found : by the easy jump that each start was, the number in which it ended; nan for none.
-    limits : what ends it, the dearest first.
+    limits : the limits that end it, the highest worth first.
     share, runs : of a plan at this share of the record, played in each engine.
     asked : the rest of what was asked for, as arguments of :func:`record`.
     """
@@ -149,8 +149,8 @@ class Record(Shown):
         return f" and at most {self.bound:.2f} {self.unit}{by}"
 
     def prices(self, most: int = MOST) -> Prices:
-        """What more of the ``most`` dearest limits of joints would buy, and of friction, mass and
-        legs [m or rad per unit]; each checked by a record with it moved (a second or two).
+        """Gain per unit of the ``most`` limits of joints with the highest price, and of friction,
+        mass and legs [m or rad per unit]; each checked by a record with it moved (a second or two).
         """
         return priced(self, most)
 
@@ -267,7 +267,7 @@ class _Search:
             yield self.at(max(best, key=lambda x: x[0])[1], share)
 
     def from_easy(self) -> tuple[dict[str, float], Solved]:
-        """What came of each start, and the best one."""
+        """Results of all starts, and the best one."""
         found: dict[str, float] = {}
         best: list[tuple] = []
         refusal = None
@@ -318,7 +318,8 @@ class _Search:
                 )
 
     def plan_at(self, best: Solved) -> tuple[JumpPlan, Solved, Program]:
-        """The largest clean plan: the record on a mesh that is fine enough, else a little less;
+        """The largest plan that passes its audit: the record on a mesh that is fine enough, else a
+        little less;
         with the record in the program's words.
         """
         robot = self.planner.robot
@@ -396,7 +397,7 @@ def _usual(body: Body, what: str) -> JumpTask:
 # what ends it
 # ----------------------------------------------------------------------------------------------
 def _binding(program: Program, task: JumpTask, solved: Solved) -> list[Binding]:
-    """The limits that end a record, the dearest first."""
+    """The limits that end a record, the highest worth first."""
     phases = {p.name: p for p in solved.solution.problem.phases}
     ends = np.cumsum([x.duration for x in solved.solution.phases.values()]).tolist()
     began = dict(zip(phases, [0.0, *ends], strict=False))

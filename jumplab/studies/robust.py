@@ -55,9 +55,9 @@ def robust_changes(
 
     In place of the capture window stands the cost of :func:`capture_term` over sampled robots; a
     flip keeps its own rows for that, and opens its tuck with :data:`OPENING_SHARE` of the joints'
-    speeds. Friction, torque and speed are used up to the least that ``ranges`` leave. What else
-    differs (delay, motors, ground, shoves, sensors, posture) is not seen: it does not depend on the
-    plan's masses or limits. Own limits win.
+    speeds. Friction, torque and speed are used up to the least that ``ranges`` leave. Other
+    differences (delay, motors, ground, shoves, sensors, posture) are not seen: they do not depend
+    on the plan's masses or limits. Own limits win.
 
     Raises :class:`InputError` if ``ranges`` have nothing that a plan can allow for.
     """
@@ -135,8 +135,8 @@ def opposite(drawn: Perturbation) -> Perturbation:
 
 
 def capture_point(model: SpatialModel, body: Body, ends: Mapping[str, SimpleNamespace]) -> ca.SX:
-    """Where another robot that makes this motion comes to rest (2,), from the middle of its soles
-    [m].
+    """Point where another robot that makes this motion comes to rest (2,), from the middle of its
+    soles [m].
 
     Its joints move as planned, and its feet with them until take-off: there it has the momentum
     that its own masses give. In flight that stays, and the body turns by I^-1 (L - L of the joints

@@ -48,7 +48,7 @@ Plain = dict[str, Any]  # data as JSON has them, of one case for example
 
 # keys ------------------------------------------------------------------------------------------
 def short_hash(data: Any) -> str:
-    """64 bits of a hash of JSON data, enough to tell cases apart."""
+    """64 bits of a hash of JSON data, enough to distinguish cases."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -69,7 +69,9 @@ def key_of(*decisive: Any) -> str:
 
 
 def deciding() -> dict[str, str]:
-    """What decides results besides their case, here: the code, and versions of packages."""
+    """Words for all that decides results besides their case: the code here, and versions of
+    packages.
+    """
     versions = store.versions()
     return {"code": code()} | {name: versions[name] for name in DECIDING}
 

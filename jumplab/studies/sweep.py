@@ -56,7 +56,7 @@ class Case:
     method: str = "direct"
 
     def key(self, *more: Any) -> str:
-        """What tells this case from all others; ``more`` decides it as well."""
+        """Key of this case, different for all others; it depends on ``more``, too."""
         weights = dict(self.weights)
         return key_of(self.method, robot_of(self.robot).hash, weights, asdict(self.task), *more)
 

@@ -2,7 +2,7 @@
 order.
 
 A trial is decided by its key alone (seed, number, settings, plan), and every finished one is kept
-at once. A run that is stopped therefore goes on where it was, and gives what it would have given
+at once. A run that is stopped therefore resumes where it was, and gives what it would have given
 undisturbed.
 """
 
@@ -111,7 +111,7 @@ class PlanOnFile:
 # ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class TrialSettings:
-    """How the robots of a Monte Carlo are drawn and made to jump."""
+    """Settings of a Monte Carlo: the draws of its robots, and the playback of their jumps."""
 
     mode: str = "position"  # the servo that plays the tape until touchdown
     reaim: bool = True  # put the legs in the air to where they can catch the robot
@@ -166,7 +166,7 @@ class TrialSettings:
 
 @dataclass(frozen=True)
 class TrialKey:
-    """What decides a trial's outcome, bit for bit: equal keys, equal trials."""
+    """Key of all that decides a trial's outcome, bit for bit: equal keys, equal trials."""
 
     seed: int
     index: int
@@ -199,7 +199,7 @@ class Trial:
 
     @property
     def cause(self) -> str:
-        """What a failure is counted as: the cause whose sign came first."""
+        """Cause by which a failure is counted: the one whose sign came first."""
         return self.signs[0].cause if self.signs else "other"
 
     def to_json(self) -> Plain:
@@ -239,7 +239,8 @@ def run_trial(
 def judged(
     simulate: Callable[[], SimulationResult],
 ) -> tuple[bool, str, Metrics | None, tuple[Sign, ...]]:
-    """Whether a jump counts as landed, why (not), its metrics and the signs of its failure.
+    """Verdict on a jump: whether it counts as landed, the reason, its metrics and the signs of its
+    failure.
 
     A run that fails one of its checks has not landed.
     """
@@ -292,7 +293,7 @@ class TrialReport(Shown):
     resumed: int = 0  # how many were taken from an earlier run
 
     def line(self) -> str:
-        """How many landed."""
+        """Number of robots that landed, in one line."""
         low, high = self.interval
         steps = f" ({self.stepped} with a recovery step)" if self.settings.step else ""
         return f"{self.landed} of {self.count} land{steps}, 95 % interval {low:.1%} ... {high:.1%}"
@@ -335,8 +336,8 @@ class TrialReport(Shown):
 
     @property
     def reasons(self) -> dict[str, int]:
-        """How often robots failed for which reason, the most frequent first; numbers and sides are
-        left out.
+        """Number of failures for each reason, the most frequent first; numbers and sides are left
+        out.
         """
         reasons = (re.sub(r"[+-]?\d+(\.\d+)?", "...", t.reason) for t in self.failed)
         kinds = Counter(re.sub("left_|right_", "", reason) for reason in reasons)
@@ -344,7 +345,7 @@ class TrialReport(Shown):
 
     @property
     def causes(self) -> dict[str, int]:
-        """How many failures each cause explains, see :func:`jumplab.sim.signs`, the most frequent
+        """Number of failures for each cause, see :func:`jumplab.sim.signs`, the most frequent
         first.
         """
         return dict(Counter(t.cause for t in self.failed).most_common())

@@ -1,4 +1,4 @@
-"""What a G1 can do within its maker's motor curves: the rows of ``acrobatics.jsonl``.
+"""Acrobatics of a G1 within its maker's motor curves: the rows of ``acrobatics.jsonl``.
 
 ``python -m paper.acrobatics [KIND ...]`` in the folder of the notebooks plans and audits what :data:`ASKED` has and the
 log lacks, plays each clean plan back in both engines, and can be stopped and started again; ``python -m
@@ -151,7 +151,7 @@ def rows() -> list[dict[str, Any]]:
 
 
 def lands(row: dict[str, Any]) -> bool:
-    """Whether a plan is clean and lands in every engine that was asked."""
+    """Whether a plan passes its audit and lands in every engine that was asked."""
     return row["clean"] and all(found[0] for found in row["landed"].values())
 
 

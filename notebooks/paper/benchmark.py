@@ -117,7 +117,7 @@ TO_THE_END = {"acceptable_iter": 0, "tol": 1e-6}  # of ipopt, where the usual pl
 def density(
     robot: Robot, task: JumpTask, spacings: Sequence[int] = SPACINGS, targets: int = TARGETS
 ) -> list[dict[str, Any]]:
-    """Plans from atlases of the same area and ever more nodes: what they take, and how much dearer than the best.
+    """Plans from atlases of the same area and ever more nodes: their times, and their extra costs over the best.
 
     The best is what ipopt finds from there, to the end. ``iterations`` and ``cpu_ms`` are medians, the latter of a plan
     with its tape.

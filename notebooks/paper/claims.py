@@ -57,7 +57,8 @@ class Claim:
     ----------
     sentence : what is said, in our words.
     where : notebook that shows it at length.
-    limits : what is measured, with its unit -> least and most for which the claim holds; None if nothing here can tell.
+    limits : what is measured, with its unit -> least and most for which the claim holds; None if nothing here can
+    measure it.
     adopted : whether the measurement reads back what was built so; it can fail, but proves nothing of the paper.
     """
 
@@ -399,7 +400,7 @@ def against_crouch(rows: Sequence[Start]) -> list[dict]:
 
 
 def spared(rows: Sequence[Start]) -> str:
-    """What stage 2's motion spares against a crouch, in words."""
+    """Savings by stage 2's motion as a start, against a crouch, in words."""
     crouch, guess = against_crouch([r for r in rows if r.start in STARTS[:2]])
     shares = (guess[key] for key in ("iterations, share", "with the guess, share"))
     gain = ["?" if share is None else f"{1 - share:.0%}" for share in shares]
@@ -430,7 +431,7 @@ def drawn_in(run: SimulationResult, robot: Robot) -> dict[str, float]:
 
 
 def trunk_feels(run: SimulationResult, robot: Robot) -> np.ndarray:
-    """What an accelerometer at the trunk's centre of mass reads in each control cycle (N - 1,) [g].
+    """Readings of an accelerometer at the trunk's centre of mass in each control cycle (N - 1,) [g].
 
     The change of the simulated velocity over a cycle, less gravity; whatever turns with the robot has the same size.
     """
@@ -462,8 +463,8 @@ def _momentum_off(run: SimulationResult, tape: Tape) -> tuple[np.ndarray, np.nda
 
 
 def vibration(run: SimulationResult, tape: Tape) -> tuple[int, int]:
-    """How often simulated less planned L swings by more than :data:`SWING` in the first 0.1 s, and after, until 50 ms
-    before lift-off, where the plan itself is fast.
+    """Number of swings of simulated less planned L by more than :data:`SWING` in the first 0.1 s, and after, until 50
+    ms before lift-off, where the plan itself is fast.
 
     A vibration swings to and fro; one blow makes two swings, a drift none, since its mean over 20 ms is taken away.
     """
@@ -476,7 +477,7 @@ def vibration(run: SimulationResult, tape: Tape) -> tuple[int, int]:
 
 
 def swings(values: np.ndarray, least: float) -> int:
-    """How many times ``values`` (N,) go up or down by at least ``least``, smaller turns between left out."""
+    """Number of times that ``values`` (N,) go up or down by at least ``least``, smaller turns between left out."""
     count, way, end = 0, 0, float(values[0])
     for x in values:
         if way * (x - end) > 0:
@@ -487,7 +488,7 @@ def swings(values: np.ndarray, least: float) -> int:
 
 
 def bow_deg(pitch: np.ndarray, rate: np.ndarray) -> float:
-    """How far a trunk is bent forward from where it begins [deg] when the push begins.
+    """Angle by which a trunk is bent forward from where it begins [deg] when the push begins.
 
     ``pitch`` (N,) [rad], ``rate`` (N,) at which the CoM rises [m/s]: the push begins where it falls fastest, before it
     rises fastest.
@@ -513,7 +514,7 @@ def touchdown_postures(plan: JumpPlan) -> list[dict[str, float | str]]:
 
 
 def readings(notebooks: Iterable[str | Path]) -> list[dict[str, str]]:
-    """What the notebooks do differently from the paper, gathered from the tables at their ends.
+    """Differences of the notebooks from the paper, gathered from the tables at their ends.
 
     Returns
     -------

@@ -79,7 +79,7 @@ def framework() -> Figure:
         arrow(ax, (x + 0.04, 2.45), (x + gap - 0.04, 2.45))
         ax.text(x + gap / 2, 2.62, text, ha="center", va="bottom", fontsize=7, linespacing=1.2)
     x = first + 3 * (width + gap)
-    _box(ax, x, 2.6, 14.27 - x, 1.55, "audit\nsecond\ncode path", INK, strength=0.06)
+    _box(ax, x, 2.6, 14.27 - x, 1.55, "audit,\nindependent", INK, strength=0.06)
     _box(ax, x, 0.75, 14.27 - x, 1.55, "simulation\nplayback,\nlanding", LANDING)
     start, end = (first + width / 2, 0.75), (first + 2 * (width + gap) + width / 2, 0.75)
     arrow(ax, start, end, connectionstyle="arc3,rad=0.16", color="#555555")

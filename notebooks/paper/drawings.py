@@ -240,7 +240,7 @@ def _end_angles(ax: Axes, t: np.ndarray, angle: np.ndarray, away_from: float | N
     up = 1 if angle[-1] > angle[0] else -1
     last = up if away_from is None else int(np.sign(angle[-1] - away_from)) or up
     for row, side, ha in ((0, -up, "left"), (-1, last, "right")):
-        gap = 3 if row == 0 or last == up else 11  # points; beside a slope more room is needed
+        gap = 3 if row == 0 or last == up else 11  # points; beside a slope more space is needed
         look = {"fontsize": 7, "ha": ha, "va": "bottom" if side > 0 else "top", "textcoords": "offset points"}
         ax.annotate(_degrees(angle[row]), (t[row], np.degrees(angle[row])), (0, gap * side), **look)
 
@@ -308,7 +308,7 @@ FRAMES_LAUNCH, FRAMES_FLIGHT = 6, 5
 PITCH_M = 0.66  # how far the frames are apart
 GAP_M = 0.12  # between launch and flight
 LEVEL_M = 1e-3  # a platform lower than this is none
-TEXT_M = 0.24  # room for the frames' times below the ground
+TEXT_M = 0.24  # space for the frames' times below the ground
 ALIKE = 0.9  # values closer than this ratio are drawn on an axis of their own instead of from zero
 START_COLORS = (LAUNCH, FLIGHT)  # in turn
 

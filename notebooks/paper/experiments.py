@@ -404,7 +404,7 @@ def basin_map(states: Sequence[Trial]) -> Figure:
 
 
 def _height_text(rise_m: float) -> str:
-    """How far the CoM is off its planned height, in words."""
+    """Deviation of the CoM from its planned height, in words."""
     return f"{abs(rise_m):g} m {'higher' if rise_m > 0 else 'lower'}" if rise_m else "planned height"
 
 
@@ -472,7 +472,7 @@ def chain_errors(result: ChainResult, trials: Sequence[dict] = ()) -> Figure:
 
 @styled
 def chain_timeline(result: ChainResult) -> Figure:
-    """What the robot does above, when its plans are made below; a tick where it was ready for the plan."""
+    """Motion of the robot above, making of its plans below; a tick where it was ready for the plan."""
     fig = new_figure(PAGE_IN, 1.5)
     ax = fig.subplots()
     starts = [0, *(np.flatnonzero(result.phase[1:] != result.phase[:-1]) + 1), len(result.phase)]
@@ -555,13 +555,13 @@ def chain_strobe(result: ChainResult) -> Figure:
 
 
 def span(result: ChainResult) -> tuple[float, float]:
-    """What to show of the ground of a chain: from, to [m]."""
+    """Part of the ground of a chain to show: from, to [m]."""
     x = result.q[:, 0]
     return float(x.min()) - AROUND_M, float(x.max()) + AROUND_M
 
 
 def draw_goals(ax: Axes, result: ChainResult) -> None:
-    """Where the toes should stand after each jump."""
+    """Draw the places where the toes should stand after each jump."""
     foot = result.robot.foot
     zero = foot.toe - float(foot.center[0])
     for goal, top in zip(result.course.goals_m, result.course.platforms_m, strict=True):

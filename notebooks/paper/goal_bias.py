@@ -67,7 +67,7 @@ class GoalBias:
 
     @property
     def bias_m(self) -> tuple[float, float]:
-        """What had to be added to the goal: distance, height [m]."""
+        """Correction that the goal needed: distance, height [m]."""
         target = self.jumps[-1].target
         return target.distance_m - self.goal.distance_m, target.height_m - self.goal.height_m
 
@@ -178,7 +178,8 @@ def study(path: Path = LOG, robots: Sequence[int] = range(1, ROBOTS + 1)) -> Non
 
 
 def corrected(goal: JumpTask, planner: Planner, different: Perturbation) -> dict[str, Any]:
-    """What becomes of one robot, in plain data: its first jump, how many it took, and whether the last hit the goal."""
+    """Result of one robot, in plain data: its first jump, the number of its jumps, and whether the last hit the goal.
+    """
     runs: list[SimulationResult] = []
 
     def simulate(*args: Any, **options: Any) -> SimulationResult:
@@ -198,7 +199,9 @@ def corrected(goal: JumpTask, planner: Planner, different: Perturbation) -> dict
 
 
 def told(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """How many robots land at once, median and worst of their miss [mm], how many hit the goal, in how many jumps."""
+    """Number of robots that land at once, median and worst of their miss [mm], number that hit the goal, and their
+    jumps.
+    """
     first = [abs(row["missed_mm"][0]) for row in rows if row["landed"][0]]
     hit = [row["jumps"] for row in rows if row["hit"]]
     return {

@@ -74,7 +74,7 @@ def cases() -> list[Case]:
 
 @cache
 def _planner(kind: str, variant: int) -> Planner:
-    """Who plans a kind of cases, its stages built."""
+    """Planner of a kind of cases, its stages built."""
     robot, limits = Robot.load(), LIMITS[variant] if kind == "tight limits" else None
     if kind == "other robots":
         changed = (

@@ -134,11 +134,11 @@ def straight_push(envelope: Reach) -> float:
 
 
 def bounded(path: Path) -> dict[str, Any]:
-    """How high a robot jumps on the spot, as far as plans are found, on a ladder of rises :data:`STEP` apart.
+    """Greatest rise of a robot on the spot for which a plan is found, on a ladder of rises :data:`STEP` apart.
 
     From above what a straight push may give, the ladder is gone down to the first rung with a clean plan by either
-    method, and from there up again, each plan begun with the one below or with a jump ahead. ``refused`` tells by
-    method why there is none on the rung above.
+    method, and from there up again, each plan begun with the one below or with a jump ahead. ``refused`` has the
+    reasons, by method, why there is none on the rung above.
     """
     EXPLAINED.set(False)  # nobody reads why
     planner = Planner(examine(path).robot)
@@ -189,7 +189,7 @@ def _tried(ways: dict[str, Callable[[], Any]]) -> tuple[Any, dict[str, str]]:
 
 
 def within_time(work_on: Callable[[Path], dict[str, Any]], path: Path, longest_s: float = PLAN_S) -> dict[str, Any]:
-    """What ``work_on`` finds in a process of its own, given up after ``longest_s`` [s] of processor time."""
+    """Result of ``work_on`` in a process of its own, given up after ``longest_s`` [s] of processor time."""
     limit = resource.RLIMIT_CPU, (int(longest_s), int(longest_s))
     with ProcessPoolExecutor(1, initializer=resource.setrlimit, initargs=limit) as pool:
         work = pool.submit(work_on, path)

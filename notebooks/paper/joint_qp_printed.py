@@ -34,7 +34,7 @@ LOADED_N, HEEL_UP_M = 20.0, 0.0025  # a foot has a CoP, and a heel is up, beyond
 
 @dataclass(frozen=True)
 class Form:
-    """How the paper's QPs are read. The defaults are the library's; :data:`PRINTED` is the letter of the paper.
+    """Reading of the paper's QPs. The defaults are the library's; :data:`PRINTED` is the letter of the paper.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class PrintedLaunch(LaunchQp):
     form = Form()
 
     def target(self, k, now):
-        """What a step asks for; with a free contact no step is on the toes."""
+        """Aims of a step; with a free contact no step is on the toes."""
         target = super().target(k, now)
         if self.form.contact == "free" or target.on_toes:
             target.heel_floor = np.zeros(2) if self.form.heel == "always" else self.heel_floor(now)
@@ -180,7 +180,7 @@ def readings_tried(
 
 
 def cop_behind_toe_mm(plan: JointPlan, robot: Robot) -> float:
-    """How far the CoP of a loaded left foot gets behind its toe while the heel is up [mm]."""
+    """Largest distance of the CoP of a loaded left foot behind its toe while the heel is up [mm]."""
     body, behind = FullBody(robot), 0.0
     for k in range(plan.rows("launch").stop - 1):
         x, f = body.terms(plan.q[k], plan.v[k]), plan.f[k, 0]

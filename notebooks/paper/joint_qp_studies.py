@@ -1,4 +1,4 @@
-"""What stage 2's notebook measures: its programs in cvxpy against the library's, one weight or choice at a time."""
+"""Measurements of stage 2's notebook: its programs in cvxpy against the library's, one weight or choice at a time."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def parameters(numbers: Mapping[str, Any]) -> SimpleNamespace:
 
 
 def shared_numbers(terms: FullTerms, wish: Any, qp: Any, state: State, step_s: float) -> dict[str, Any]:
-    """What the programs of both phases need: quantities, wishes of joints and trunk, limits of the joints.
+    """Numbers for the programs of both phases: quantities, aims of joints and trunk, limits of the joints.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def _in_force(block: Block) -> tuple[np.ndarray, ...]:
 
 
 def _apart(qp: Qp, best: np.ndarray, x: np.ndarray, cost: float, first: int) -> dict[str, float | None]:
-    """How far ``x`` and its cost are from the optimum ``best``; accelerations begin at column ``first``."""
+    """Distances of ``x`` and its cost from the optimum ``best``; accelerations begin at column ``first``."""
     A, b, E, *_ = wide(qp)
     cheapest = np.sum((A @ best - b) ** 2) / 2
     free, scale, off = A @ null_space(E), max(1.0, cheapest), 1e6 * np.abs(x - best)
@@ -205,7 +205,7 @@ def _apart(qp: Qp, best: np.ndarray, x: np.ndarray, cost: float, first: int) -> 
 
 
 def weights_tried(srmp: SrmpPlan, robot: Robot, phase: str, name: str, values: Sequence[float]) -> list[dict]:
-    """How well stage 1 is followed, and what the launch takes of the joints' speeds, by the weight of one wish."""
+    """Errors against stage 1, and joint speeds of the launch, by the weight of one aim."""
     top, rows = np.array([robot.actuators[joint]["speed"] for joint in robot.joint_names]), []
     for value in values:
         options = Options(**{phase: replace(getattr(Options(), phase), **{name: value})})

@@ -1,4 +1,5 @@
-"""What a roll-out of stage 2 breaks, by Pinocchio's inverse dynamics and the robot's limits, not the QPs' matrices."""
+"""Violations of a roll-out of stage 2, by Pinocchio's inverse dynamics and the robot's limits, not the QPs' matrices.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from jumplab.io.folder import PLAN, sha256, versions
 from jumplab.robot import Robot
 
 Row = dict[str, Any]
-# rooms whose code decides what a study finds; a reading, a picture or a command does not
+# sub-packages whose code decides what a study finds; a reading, a picture or a command does not
 ROOMS = ("robot", "models", "ocp", "stages", "auditing", "control", "sim", "studies")
 STAMP = "stamp"
 NAMED = 3  # changed files in a line
@@ -33,7 +33,9 @@ NAMED = 3  # changed files in a line
 
 @cache
 def code() -> dict[str, str]:
-    """File of the library, ``room/name.py`` -> digest of what it does: comments, docstrings and layout do not count."""
+    """File of the library, ``sub-package/name.py`` -> digest of what it does: comments, docstrings and layout do not
+    count.
+    """
     root = Path(jumplab.__file__).parent
     files = sorted(p for room in ROOMS for p in (root / room).rglob("*") if p.suffix in (".py", ".toml"))
     return {path.relative_to(root).as_posix(): digest(path) for path in files}
@@ -61,7 +63,9 @@ class _Bare(ast.NodeTransformer):
 
 
 def stamp(folder: str | Path | None = None, robot: Robot | None = None) -> Row:
-    """Who makes rows now: code, versions, machine; the plan of a result folder and a robot, where a study is of one."""
+    """Stamp of rows that are made now: code, versions, machine; plan of a result folder and robot, where a study is of
+    one.
+    """
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     made = {"code": code(), "version": versions()["jumplab"], "machine": machine}
     if folder is not None:
@@ -72,7 +76,7 @@ def stamp(folder: str | Path | None = None, robot: Robot | None = None) -> Row:
 
 
 def age(stamps: Iterable[Mapping[str, Any] | None]) -> str:
-    """How many rows, each given by its stamp or None, are of the code of now, and what changed since the others.
+    """Number of rows, each given by its stamp or None, that are of the code of now, and the changes since the others.
 
     A file that came later does not count: it can only matter through a change of one that was there.
     """
@@ -147,7 +151,7 @@ def write(path: Path, found: Iterable[Row], **of: Any) -> None:
 
 
 def table(path: Path, say: Callable[[str], Any] = print) -> Any:
-    """What :func:`write_table` has written, or a table without a stamp, after a line that says how old it is."""
+    """Content of a table by :func:`write_table`, or of one without a stamp, after a line on its age."""
     found = json.loads(path.read_text(encoding="utf-8"))
     made = found.get(STAMP) if isinstance(found, dict) else None
     inner = found if made is None else found["table"]

@@ -1,4 +1,4 @@
-"""What a laboratory could know of a jump: estimated from simulated, noisy sensors with the planned robot's model."""
+"""Measurements of a jump in a laboratory: estimates from simulated, noisy sensors with the planned robot's model."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from jumplab.sim.sensors import Sensors
 
 @dataclass(frozen=True)
 class Measurement:
-    """A jump as its sensors tell it, up to touchdown.
+    """A jump as its sensors measure it, up to touchdown.
 
     Attributes
     ----------
     t : (N,) [s].
     phase : (N,) "launch" or "flight".
-    com : (N, 2) x and z [m], from where the robot was put; in flight the inertial unit alone tells it.
+    com : (N, 2) x and z [m], from where the robot was put; in flight by the inertial unit alone.
     L : (N,) angular momentum about the pitch axis [kg m^2/s].
     rho : (N,) pitch inertia about the CoM [kg m^2].
     """

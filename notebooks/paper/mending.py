@@ -35,7 +35,7 @@ def study(folder: str | Path, path: Path = LOG, robot: str = "g1") -> None:
 
 
 def row_of(before: ClipReport) -> dict[str, Any]:
-    """What becomes of one clip: its measures before and after, what was kept, or why it cannot be mended."""
+    """Result of one clip: its measures before and after, the parts that were kept, or why it cannot be mended."""
     began = time.process_time()
     row = {"clip": before.clip.name, "before": _measures(before), "cpu_s": None}
     try:

@@ -1,6 +1,6 @@
 """The same jump by crocoddyl, which knows multiple shooting and DDP and no hard limits: time and quality of its answer.
 
-Crocoddyl wants another Pinocchio than this package, so it runs in an environment of its own:
+Crocoddyl needs another Pinocchio than this package, so it runs in an environment of its own:
 ``pip install crocoddyl==3.2.1 pin==4.0.0``, then ``python peer_crocoddyl.py OUT.json DIR...`` with folders of plans.
 The durations of launch and flight are the plan's, with flat feet; what the plan has as limits are barriers here, and
 motors have neither a torque-speed line nor rotors. It moves a floating base with all joints of the robot, also where
@@ -100,7 +100,7 @@ class Jump:
         return node
 
     def measured(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, n: int, steps: np.ndarray) -> dict[str, float]:
-        """What a motion does: travel, rise from take-off at row ``n``, largest shares of torque and speed, effort."""
+        """Measures of a motion: travel, rise from take-off at row ``n``, largest shares of torque and speed, effort."""
         pin.forwardKinematics(self.model, self.data, q[-1])
         pin.updateFramePlacements(self.model, self.data)
         ends = [self.data.oMf[foot].translation[0] for foot in self.feet]

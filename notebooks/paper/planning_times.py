@@ -1,5 +1,4 @@
-"""How long planning takes, sort by sort, in one run on one machine: medians over some targets, and
-ratios.
+"""Times of planning, sort by sort, in one run on one machine: medians over some targets, and ratios.
 
 Times are processor time: ``solver_s`` of all attempts, ``plan_s`` of the whole call, its tape and
 checks included. Ratios are of ``solver_s`` against the jumps straight ahead of the same run. Every

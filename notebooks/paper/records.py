@@ -1,8 +1,8 @@
 """Records of the robots by name: the rows of ``records.jsonl``.
 
 ``python -m paper.records`` in the folder of the notebooks seeks what :data:`LOG` lacks, a line a record, and can be
-stopped and started again; ``python -m paper.records table`` prints the file. A record is "at least": a local solver
-speaks.
+stopped and started again; ``python -m paper.records table`` prints the file. A record is a lower bound, found by a
+local solver.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def records_table() -> Table:
 
 
 def bounds_table(robot: Robot, rises_m: Sequence[float]) -> Table:
-    """What no motion of a robot exceeds, a row a rise."""
+    """Bounds that no motion of a robot exceeds, a row a rise."""
     body = Body(robot)
     rows = []
     for rise in rises_m:

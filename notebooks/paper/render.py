@@ -36,7 +36,7 @@ SEEN_M, HALF_WIDTH_M = (-4.5, 4.5), 0.45  # what is built of the ground; the lon
 GREYS = 0.87, 0.76
 BODY = {"trunk": "#4C5A70", "limb": "#BFC7D1", "rest": REST_COLOR}  # a robot outside of any phase
 COLUMNS = 6  # frames per line of a page-wide strip, each then 1.2 in wide
-TITLE_IN = 0.17  # room for a frame's title
+TITLE_IN = 0.17  # space for a frame's title
 MARK_M = 0.015  # width of a line on the ground
 LIGHT = np.array([0.4, -1.6, 2.4]) / np.linalg.norm([0.4, -1.6, 2.4])  # towards the lamp
 AMBIENT, DIFFUSE = 0.65, 0.4  # share of its colour that a face has anyway, and that the lamp adds
@@ -47,7 +47,7 @@ BELOW_M = 0.14  # seen below the ground
 
 @dataclass(frozen=True)
 class Camera:
-    """What the picture shows, in the plane through ``x`` that faces the camera."""
+    """Camera of a picture, of the plane through ``x`` that faces it."""
 
     width: float = 1.3  # [m], enough for stretched arms
     bottom: float = -BELOW_M  # [m]
@@ -64,7 +64,7 @@ class Camera:
 
     @property
     def axes(self) -> np.ndarray:
-        """Where right, up and away from the camera point (3, 3), world axes, one per row."""
+        """Directions right, up and away of the camera (3, 3), world axes, one per row."""
         (cy, sy), (cp, sp) = ((np.cos(a), np.sin(a)) for a in np.radians([self.yaw_deg, self.pitch_deg]))
         right, away = np.array([cy, sy, 0.0]), np.array([-sy * cp, cy * cp, sp])
         return np.array([right, np.cross(right, away), away])

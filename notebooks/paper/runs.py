@@ -75,7 +75,7 @@ def _on_ground(tape: Tape, robot: Robot, time_s: float) -> SimulationResult:
 def study(folder: str | Path, path: Path = LOG) -> None:
     """Many robots and the whole landing basin for the plan in ``folder``, in every engine, kept as one row each.
 
-    What the folder's log has is not simulated again. ``python -m paper.runs DIR`` calls it.
+    Trials in the folder's log are not simulated again. ``python -m paper.runs DIR`` calls it.
     """
     rows = []
     for engine in ENGINES:
@@ -86,7 +86,7 @@ def study(folder: str | Path, path: Path = LOG) -> None:
 
 
 def row(engine: str, trial: Trial) -> dict[str, Any]:
-    """What is kept of a trial: its draw in a few numbers, the verdict, the travel and rise of one that landed."""
+    """Row of a trial: its draw in a few numbers, the verdict, the travel and rise of one that landed."""
     m, seen = trial.metrics, {name: float(f"{x:.4g}") for name, x in trial.features.items()}
     kept = {"engine": engine, "number": trial.key.index, "features": seen, "landed": trial.landed}
     if not trial.landed or m is None:
@@ -108,7 +108,7 @@ def stored(engine: str, feature: str, path: Path = LOG) -> list[SimpleNamespace]
 
 
 def shares(trials: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
-    """How many land, by name, with Wilson's 95 % interval [%], and the reasons of those that do not."""
+    """Number of trials that land, by name, with Wilson's 95 % interval [%]."""
     rows = []
     for name, here in trials.items():
         landed, count = sum(t.landed for t in here), len(here)

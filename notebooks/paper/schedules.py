@@ -46,7 +46,7 @@ WORLDS = {
 def study(folder: str | Path, path: Path = LOG, robots: Iterable[str] = ROBOTS) -> None:
     """Plan each case, and play it in each world; one row each, written at once, plans kept in ``folder``.
 
-    What the log has is not done again. ``python -m paper.schedules DIR`` calls it.
+    Rows of the log are not made again. ``python -m paper.schedules DIR`` calls it.
     """
     with logs.keep(path, itemgetter("robot", "case")) as log:
         for robot, case in product(robots, CASES):

@@ -48,7 +48,7 @@ SYMMETRIC = Term(  # for the joint problem: about the pivot it lands too far ahe
 
 @dataclass(frozen=True)
 class PrintedResult:
-    """What the sequence came to for one target.
+    """Result of the sequence for one target.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class PrintedResult:
 
 @dataclass(frozen=True)
 class SuccessCount:
-    """How many of ``targets`` targets had a launch, and how many of those a flight as well."""
+    """Number of ``targets`` with a launch, and of those with a flight as well."""
 
     targets: int
     launches: int
@@ -115,7 +115,7 @@ def _launch_only_terms(mass: float, envelope: Reach) -> list[Term]:
 
 
 def _window_terms(envelope: Reach, s: SrmpSettings) -> list[Term]:
-    """What the printed launch lacks: at take-off the flight must still be possible."""
+    """Terms that the printed launch lacks: at take-off the flight must still be possible."""
     low, high = _inner(envelope.inertia, WINDOW_MARGIN)
 
     def rotation(p: Point):

@@ -1,8 +1,8 @@
 """Jumps in three dimensions, by the dozen: which targets are planned, and how they land.
 
 ``python -m paper.three_dimensions`` in the folder of the notebooks does what :data:`LOG` lacks, one line per target,
-and can be stopped and started again; playbacks and perturbed robots take an hour. Notebook 13 draws the file. Rows that
-tell ``attempts`` were made by the whole-body program, the others by the program before it.
+and can be stopped and started again; playbacks and perturbed robots take an hour. Notebook 13 draws the file. Rows with
+``attempts`` were made by the whole-body program, the others by the program before it.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ def maps(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
 
 # one turn --------------------------------------------------------------------------------------------------------
 def yaw_sources(tape: Tape, robot: Robot) -> dict[str, dict[str, np.ndarray]]:
-    """Where the angular momentum about the vertical is, and where it comes from.
+    """Angular momentum about the vertical, by the limbs that carry it and by its sources.
 
     Returns
     -------
@@ -255,7 +255,7 @@ def yaw_momentum(tape: Tape, sources: Mapping[str, Mapping[str, np.ndarray]]) ->
 
 
 def turned(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
-    """How far a robot has turned about the vertical, as a whole and by its base.
+    """Turn of a robot about the vertical, as a whole and of its base.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""How far stage 2's motion, and the finished jump, are from stage 1's trajectories."""
+"""Differences of stage 2's motion, and of the finished jump, from stage 1's trajectories."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TRACKED = {"rho": "rho", "rho_rate": "rho_rate", "velocity": "com_velocity", "L"
 
 
 def compared(plan: JointPlan, srmp: SrmpPlan, robot: Robot) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """What stage 2's motion does and what stage 1 asks for, at the same nodes.
+    """Quantities of stage 2's motion, and those that stage 1 asks for, at the same nodes.
 
     com (from the pivot) [m] and com_velocity [m/s] (N, 2), L [kg m^2/s] and rho [kg m^2] (N,), in flight foot_com, the
     middle of the soles from the CoM [m].
@@ -67,7 +67,7 @@ def tracking(plan: JointPlan, srmp: SrmpPlan, robot: Robot) -> dict[str, float]:
 
 
 def jump_tracking(plan: JumpPlan) -> dict[str, dict[str, dict[str, float]]]:
-    """How far the tape is from stage 1's trajectories, compared at the same share of each phase (WL-J1, WF-J1).
+    """Differences of the tape from stage 1's trajectories, compared at the same share of each phase (WL-J1, WF-J1).
 
     Returns
     -------
@@ -91,8 +91,8 @@ def jump_tracking(plan: JumpPlan) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def launch_followed(plan: JumpPlan) -> dict[str, float]:
-    """How far the launch is from stage 1's: rms of ``L`` and ``velocity`` as shares of their peaks, and of ``rho`` as a
-    share of its mean (Sec. V-A).
+    """Differences of the launch from stage 1's: rms of ``L`` and ``velocity`` as shares of their peaks, and of ``rho``
+    as a share of its mean (Sec. V-A).
     """
     missed, asked = jump_tracking(plan)["launch"], plan.srmp.launch
     return {

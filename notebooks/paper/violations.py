@@ -1,4 +1,4 @@
-"""What no physics would play back: the same checks for stage 3 as printed and for ours, at every millisecond."""
+"""Violations of physics, by the same checks for stage 3 as printed and for ours, at every millisecond."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FREE_FALL, RESIDUAL_PERCENT, DRIFT, PITCH_RAD = 0.1, 0.5, 0.01, 0.01  # [m/s^2],
 
 
 def violations(plan: Any, robot: Robot) -> tuple[dict, ...]:
-    """What no physics would play back, found by evaluating a motion again at every millisecond.
+    """Violations of physics in a motion, found by evaluating it again at every millisecond.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def planar_motion(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
 
 
 def _heel_up(motion, x) -> tuple[np.ndarray, np.ndarray]:
-    """Where the heel is up, and where there is a moment about the toe as well."""
+    """Whether the heel is up, and whether there is a moment about the toe as well, sample by sample."""
     up = motion["toe"][:, 1] + x["heel"][:, 1] > HEEL_UP_M
     return up, up & (np.abs(x["moment"]) > MOMENT_NM)
 

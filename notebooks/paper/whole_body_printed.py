@@ -49,7 +49,7 @@ AT_TAKEOFF = "base rows at take-off"  # of the flight, its first node
 
 @dataclass(frozen=True)
 class PrintedPlan:
-    """What the printed problems came to for one target.
+    """Result of the printed problems for one target.
 
     Attributes
     ----------
@@ -265,7 +265,7 @@ class PrintedWholeBody:
         return np.stack([np.interp(at, t, c) for c in np.reshape(columns, (len(t), -1)).T], -1)
 
     def _guess(self, joints: JointPlan, phase: str) -> dict[str, PhaseGuess]:
-        """Stage 2's base link is the paper's base; its left side speaks for both."""
+        """Stage 2's base link is the paper's base; its left side stands for both."""
         rows, model = joints.rows(phase), self.robot.model
         t, q, v = joints.t[rows], joints.q[rows], joints.v[rows]
         left = {row: (model.getJointId(name), sign) for name, row, sign in reversed(self.robot.role_signs())}

@@ -1,4 +1,4 @@
-"""What belongs to a notebook that somebody looks at: counted loops, and whether anybody does.
+"""Loops with a counter, and whether a notebook is open in an editor, where it can be seen.
 
 A cell that takes long shows what its work says of itself (:mod:`jumplab.show.waiting`); a notebook that papermill
 executes shows nothing.
@@ -14,7 +14,7 @@ from typing import TypeVar
 from jumplab.io.progress import tell
 
 T = TypeVar("T")
-SESSION = "JPY_SESSION_NAME"  # set by Jupyter's server for the kernel of a notebook that somebody has opened
+SESSION = "JPY_SESSION_NAME"  # set by Jupyter's server for the kernel of a notebook that is open
 
 
 def watched() -> bool:

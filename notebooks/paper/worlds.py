@@ -88,7 +88,7 @@ def falls(tape: Tape, robot: Robot, scene: Scene, causes: Iterable[str] = FALLS)
 def study(folder: str | Path, path: Path = LOG, *, jobs: int | None = None) -> None:
     """Let robots jump the plan in ``folder`` in every world and engine; one row each, written after every series.
 
-    What the folder's log has is not simulated again. ``python -m paper.worlds DIR [JOBS]`` calls it.
+    Trials in the folder's log are not simulated again. ``python -m paper.worlds DIR [JOBS]`` calls it.
     """
     rows = []
     for world, engine, reaim in product(WORLDS, ENGINES, (True, False)):
@@ -138,7 +138,7 @@ def drawn(seed: int = 41) -> dict[str, tuple[str, jl.JumpTask]]:
 def contacts(folder: str | Path, path: Path = DRAWN, *, jobs: int | None = None) -> None:
     """Play the :func:`drawn` plans in every world of :data:`PLAYED` and each way; a row each, written at once.
 
-    What the log has is not done again; plans are kept in ``folder``. ``python -m paper.worlds --contacts DIR [JOBS]``
+    Rows of the log are not made again; plans are kept in ``folder``. ``python -m paper.worlds --contacts DIR [JOBS]``
     calls it.
     """
     cases = drawn()
@@ -238,7 +238,7 @@ def in_words(disturbance: str) -> str:
 
 
 def moved(usual: MarginReport, other: MarginReport) -> list[dict[str, Any]]:
-    """A line per disturbance that both know and one of them does not bear to its limit: how far the margin moved.
+    """A line per disturbance that both know and one of them does not tolerate to its limit: how far the margin moved.
 
     Shares count from nothing to the limit; from a margin of nothing no gain is told.
     """
@@ -255,7 +255,7 @@ def moved(usual: MarginReport, other: MarginReport) -> list[dict[str, Any]]:
 def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """A line per world and engine in which robots jumped re-aimed, and the same ones or some of them plain.
 
-    It tells how many land of each, Wilson's 95 % interval of the re-aimed, and the causes of their falls.
+    It has the number that land of each, Wilson's 95 % interval of the re-aimed, and the causes of their falls.
     """
     table = []
     for world, engine in dict.fromkeys((r["world"], r["engine"]) for r in rows):
@@ -273,7 +273,7 @@ def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def share(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """How many of the re-aimed robots of ``rows`` land, with Wilson's 95 % interval, and what the falls begin with."""
+    """Number of the re-aimed robots of ``rows`` that land, with Wilson's 95 % interval, and the causes of the falls."""
     landed = sum(r["landed"] for r in rows)
     low, high = wilson(landed, len(rows))
     causes = Counter(r["cause"] for r in rows if not r["landed"]).most_common()

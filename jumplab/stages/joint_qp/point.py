@@ -1,4 +1,5 @@
-"""What a term of stage 2 sees of a step: numbers, and quantities that are affine in its unknowns.
+"""Quantities of a step that a term of stage 2 can use: numbers, and expressions that are affine in
+the step's unknowns.
 
 >>> still = jl.Term("still hands", "ours", "m/s^2", "node",
 ...                 lambda p: p.point("left_hand").acceleration, weight=1e-3)
@@ -7,8 +8,8 @@
 
 Every step has its own QP, which sees no later step. So a cost with a larger weight is smaller in
 every step from the same state, but over the roll-out only while no joint is braked before its stop:
-dearer arms, say, swing on freely, meet the stop faster, and are braked harder there than if an
-earlier step had slowed them.
+arms with a larger weight, say, swing on freely, meet the stop faster, and are braked harder there
+than if an earlier step had slowed them.
 """
 
 from __future__ import annotations

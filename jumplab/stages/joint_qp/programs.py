@@ -24,7 +24,7 @@ INERTIA_BLEND_S = 0.08  # arms and trunk are quicker than legs; shorter, they ar
 
 @dataclass(frozen=True)
 class Track:
-    """What stage 1 asks for at the nodes of n steps: value and rate (n + 1, ...)."""
+    """Trajectory of stage 1 at the nodes of n steps: value and rate (n + 1, ...)."""
 
     t: np.ndarray  # (n + 1,) [s]
     value: np.ndarray
@@ -65,7 +65,7 @@ def in_space(x: np.ndarray) -> np.ndarray:
 
 
 class PhaseQp:
-    """What the QPs of launch and flight share. Pure: nothing here solves or remembers a state.
+    """Common part of the QPs of launch and flight. Pure: nothing here solves or remembers a state.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ class PhaseQp:
         return (-back - rates) / step_s, (forth - rates) / step_s
 
     def _asked(self, k: int, now: FullTerms, **more) -> SimpleNamespace:
-        """What both phases ask for, from the quantities at the start of step ``k``, and ``more``.
+        """Aims of both phases, from the quantities at the start of step ``k``, and ``more``.
 
         time : middle of the step, since the phase began [s].
         joints, trunk : accelerations towards the posture (nv - 6,), (3,) [rad/s^2].

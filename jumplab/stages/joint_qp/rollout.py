@@ -59,7 +59,7 @@ AT_NODES = Step._fields[:6]  # what a plan holds at every node
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the roll-out cost: steps, solver iterations, and time [s] in the solver and in all."""
+    """Effort of the roll-out: steps, solver iterations, and time [s] in the solver and in all."""
 
     steps: int
     iterations: int
@@ -73,7 +73,7 @@ class JointPlan(Shown):
     """Result of stage 2 at the N nodes of launch and flight; the instant of take-off appears once
     per phase.
 
-    What a step holds stands at the node where it begins, and again at a phase's last node.
+    Values that a step holds stand at the node where it begins, and again at a phase's last node.
     """
 
     t: np.ndarray  # (N,) [s]
@@ -95,7 +95,7 @@ class JointPlan(Shown):
         return slice(int(inside[0]), int(inside[-1]) + 1)
 
     def state(self, k: int) -> State:
-        """State at row ``k``, as :meth:`JointMapper.step` wants it."""
+        """State at row ``k``, as :meth:`JointMapper.step` needs it."""
         return State(self.q[k], self.v[k], self.a[k])
 
 

@@ -85,8 +85,8 @@ class FlightWeights:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the motion may use of ground and joints; whole families of rows are left out by the name
-    of their term.
+    """Limits of ground and joints for the motion; a family of rows is switched off by the name of
+    its term.
     """
 
     friction: float = FRICTION

@@ -1,4 +1,4 @@
-"""Why a step of stage 2 has no answer, in the words of the field."""
+"""Reasons for a step of stage 2 without an answer, in the words of the field."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def checked(phase: Phase, qp: Qp, answer: QpAnswer, t: float) -> float:
 
 
 def giving(phase: Phase, clash: Conflict) -> tuple[str, ...]:
-    """What gives way, one short line per term and unit: "'what it says' by amount unit (row,
-    row)".
+    """Terms that give way, one short line per term and unit: "'meaning of the term' by amount unit
+    (row, row)".
     """
     units = {term.name: term.unit.split(", ") for term in phase.terms}
     groups: dict[tuple[str, str], list[tuple[float, str]]] = {}

@@ -87,7 +87,7 @@ class LandingSettings:
     # [1 / (N m)^2 / s]; a quarter of the launch's, L must be gone soon
     w_momentum_rate: float = 5e-4
     w_acceleration: float = 2e-2  # [1 / (m/s^2)^2 / s] of the CoM: an even push, peak force low
-    # [1 / m^2 / s] distance from the middle of the sole: room for the controller
+    # [1 / m^2 / s] distance from the middle of the sole: a margin for the controller
     w_cop: float = 20.0
     # [1 / rad^2 / s] trunk against its pitch in the stance; ties L to the trunk's way back
     w_posture: float = 50.0

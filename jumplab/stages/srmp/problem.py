@@ -111,8 +111,8 @@ def leg_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
 
 
 def reach_terms(reach: Reach, s: SrmpSettings, heel_up: bool) -> list[Term]:
-    """What keeps the pendulum among the robot's postures: usual inertia, and with flat feet a CoM
-    not too low.
+    """Terms that keep the pendulum among the robot's postures: usual inertia, and with flat feet a
+    CoM not too low.
     """
     fit = ca.DM(reach.usual_toe_fit if heel_up else reach.usual_flat_fit)
     slope, offset = reach.low_com_fit

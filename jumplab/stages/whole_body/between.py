@@ -1,4 +1,4 @@
-"""What a tape uses of the limits, also between the nodes of the plan that it was made from."""
+"""Use of the limits by a tape, also between the nodes of the plan that it was made from."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def _gap(t: np.ndarray, values: np.ndarray, rates: np.ndarray) -> np.ndarray:
 
 
 def _pressed_outside(tape: Tape, robot: Robot, turn: np.ndarray) -> np.ndarray:
-    """How far the CoP of each foot that carries is outside its sole, on its toes beside their edge
-    (n, 2) [m].
+    """Distance by which the CoP of each foot that carries is outside its sole, on its toes beside
+    their edge (n, 2) [m].
 
     ``turn`` (n, 2, 3, 3) are attitudes of the feet.
     """

@@ -1,4 +1,4 @@
-"""What no motion of a robot exceeds in a jump from a stand: bounds by contact, reach and power,
+"""Bounds that no motion of a robot exceeds in a jump from a stand: by contact, reach and power,
 derived in ``notebooks/15_records``.
 
 They know nothing of a plan but its target, the friction, and how long the robot may push off.
@@ -63,7 +63,7 @@ def refuse_impossible(body: Body, limits: Limits, task: JumpTask) -> None:
 
 
 def push_s(limits: Limits) -> float:
-    """How long a jump from a stand may push off at most [s]."""
+    """Longest push-off of a jump from a stand [s]."""
     return limits.flat_s[1] + limits.toe_s[1]
 
 
@@ -97,8 +97,8 @@ def _power(body: Body, limits: Limits) -> float:
 
 
 def reach_and_start(body: Body) -> tuple[float, np.ndarray]:
-    """How far the CoM can be from the toes' edges at most [m], and where it waits (3,) as seen from
-    there [m]; each link counts from its own foot, those between the legs from both.
+    """Largest distance of the CoM from the toes' edges [m], and its place (3,) in the first stance
+    as seen from there [m]; each link counts from its own foot, those between the legs from both.
     """
     if "reach" not in body.made:
         tree = body.robot.model
@@ -117,8 +117,8 @@ def reach_and_start(body: Body) -> tuple[float, np.ndarray]:
 
 
 def _distances(tree: pin.Model, foot: int, tip: np.ndarray) -> np.ndarray:
-    """How far the CoM of each body (bodies,) can be from a point of the ``foot`` at most, its
-    ``tip`` (3,): the way through all joints between them, whatever their angles [m].
+    """Largest distances of the CoM of each body (bodies,) from a point of the ``foot``, its ``tip``
+    (3,): the way through all joints between them, whatever their angles [m].
     """
     out = np.zeros(tree.njoints)
     left = [(foot, tip, 0.0, 0)]

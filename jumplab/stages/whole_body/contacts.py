@@ -1,5 +1,5 @@
-"""What is on the ground, when and where: a contact schedule as a value, with the usual ones by
-name.
+"""Contact schedule: the feet on the ground, with their times and places, as a value; the usual
+schedules have names.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ class ContactPhase:
 @checked
 @dataclass(frozen=True)
 class Place:
-    """Where a foot comes down, against where it stood first; and how far the optimiser may move it.
+    """Place where a foot comes down, against where it stood first; and the range within which the
+    optimiser may move it.
 
     Attributes
     ----------
@@ -139,7 +140,7 @@ class Contacts:
         _ = self.surface
 
     def _faults(self) -> Iterator[str]:
-        """What cannot be; finds where feet land on the way."""
+        """Faults of the schedule, in words; on the way it finds where feet land."""
         phases = self.phases
         if not phases:
             yield "a contact schedule needs at least one phase"
@@ -353,7 +354,7 @@ def _off(robot: Robot, given_m: float | None) -> float:
 
 
 def _fault_of(p: ContactPhase) -> str:
-    """What is wrong with a phase by itself, or nothing."""
+    """Fault of a phase by itself, in words; empty if it has none."""
     letters = p.feet.lower() if isinstance(p.feet, str) else ""
     if letters not in ("l", "r", "lr", FLIGHT):
         return (

@@ -82,7 +82,7 @@ class Coordinates:
 
     @property
     def turns(self) -> list[int]:
-        """Where yaw, roll and pitch stand among the free coordinates, those that are."""
+        """Indices of yaw, roll and pitch among the free coordinates, of those that are free."""
         return [i for i, k in enumerate(self.free) if 3 <= k < BASE]
 
     @property

@@ -1,4 +1,4 @@
-"""Where the ground steps up or down: at a platform, or between the places of a schedule."""
+"""Edges where the ground steps up or down: at a platform, or between the places of a schedule."""
 
 from __future__ import annotations
 
@@ -54,12 +54,13 @@ class Surface:
         return np.array([np.cos(self.along_rad), np.sin(self.along_rad)])
 
     def reaching(self, more_m: float) -> float:
-        """Where the edge would be [m] if the upper part reached further, by ``more_m`` at most."""
+        """Place of the edge [m] if the upper part reached further, by ``more_m`` at most."""
         return float(self.edge_m - np.sign(self.height_m) * min(more_m, self.room_m))
 
 
 def platform_edge_m(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> float:
-    """Where the ground steps up or down in a jump straight ahead, from the toes' first place [m].
+    """Place where the ground steps up or down in a jump straight ahead, from the toes' first place
+    [m].
 
     A platform begins a little before the landing heel; when the robot jumps down, the launching
     surface ends a little ahead of its toe.
@@ -98,7 +99,7 @@ def surface_of_jump(body: Body, limits: Limits, task: JumpTask) -> Surface:
 def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts) -> Surface:
     """The ground of a schedule, between its places on either height [m].
 
-    Raises :class:`InfeasibleError` if they leave no room for the edge.
+    Raises :class:`InfeasibleError` if no edge fits between them.
     """
     height, first = contacts.surface
     if height == 0:

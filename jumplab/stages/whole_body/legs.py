@@ -20,8 +20,8 @@ Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def off_foothold(tree: SpatialState, body: Body, side: int, place: ca.SX, yaw: ca.SX) -> ca.SX:
-    """What a foot is off its foothold (6,): the middle of its toe edge from a ``place`` (3,) [m],
-    heading from ``yaw`` [rad], roll, and minus the sine of its pitch.
+    """Deviation of a foot from its foothold (6,): the middle of its toe edge from a ``place`` (3,)
+    [m], heading from ``yaw`` [rad], roll, and minus the sine of its pitch.
     """
     foot = body.feet[side]
     turn = tree.rotation(foot) @ ca.DM(body.axes[side])

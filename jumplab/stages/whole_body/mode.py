@@ -119,8 +119,8 @@ class Mode:
         return f.reshape(len(z), -1)
 
     def moving(self, x: ca.SX) -> ca.SX:
-        """What turns (.,), of derivatives of the coordinates: attitude of the base, and the joints
-        of both sides that are not held.
+        """Entries (.,), of derivatives ``x`` of the coordinates, for rotations: attitude of the
+        base, and the joints of both sides that are not held.
         """
         angles = [k for k in self.free.free if 3 <= k < BASE]
         joints = BASE + np.flatnonzero(np.abs(self.free.spread[BASE:]).any(axis=1))

@@ -303,7 +303,7 @@ def footholds(schedule: Schedule, task: JumpTask) -> list[dict[int, np.ndarray]]
 
 
 class Feet:
-    """Where the feet are along a schedule whose phases begin at ``starts`` (phases + 1,) [s]."""
+    """Places of the feet along a schedule whose phases begin at ``starts`` (phases + 1,) [s]."""
 
     def __init__(self, schedule: Schedule, task: JumpTask, starts: np.ndarray):
         self.phases = schedule.contacts.phases

@@ -1,4 +1,4 @@
-"""What the whole-body program ends in."""
+"""Result of the whole-body program."""
 
 from __future__ import annotations
 
@@ -68,7 +68,9 @@ class WholeBodyPlan(Shown):
 
     @property
     def manner(self) -> dict[str, float]:
-        """How it jumps, by fields of :class:`.Attempt`, in which plans of several starts differ."""
+        """Manner of the jump, by fields of :class:`.Attempt`, in which plans of several starts
+        differ.
+        """
         body = self.schedule.body
         q = self.tape.q[: self.tape.takeoff_index or None]
         swings = [np.ptp(q[:, 1 + column]) for column, _ in body.shoulders]

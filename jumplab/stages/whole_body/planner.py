@@ -295,7 +295,7 @@ class WholeBodyPlanner:
         return best
 
     def _explained(self, program: Program, asked: Asked) -> SolverError | None:
-        """Why there is no plan: the terms in conflict, by a short search."""
+        """Reason for the lack of a plan: the terms in conflict, by a short search."""
         start = replace(COLD[1], patience=EXPLAINING)
         try:
             program.solve(replace(asked, attempts=[]), start, explain=True)
@@ -304,8 +304,8 @@ class WholeBodyPlanner:
         return None
 
     def _check_standing(self, task: JumpTask, stance: np.ndarray | None) -> None:
-        """Refuse a robot whose motors cannot hold the posture in which it waits; of a robot that
-        five links describe the program tells.
+        """Refuse a robot whose motors cannot hold the posture in which it waits; the program itself
+        refuses robots that five links describe.
         """
         if self.robot.planar:
             return

@@ -104,7 +104,7 @@ class Program(Shown):
 
     @property
     def robot(self) -> Robot:
-        """Who moves."""
+        """The robot that moves."""
         return self.body.robot
 
     def schedule(self, apart: tuple[Apart, ...] = ()) -> Schedule:
@@ -218,8 +218,8 @@ class Program(Shown):
         return [x for x in met if left & {x.pair.first.body, x.pair.second.body}]
 
     def limits_of(self, asked: Asked, solved: Solved) -> Iterator[tuple]:
-        """What binds in a ``solved`` motion: (name, column, shares, multipliers, limits) of each
-        limit, see :func:`jumplab.ocp.posing.binding`.
+        """Limits of a ``solved`` motion that bind: (name, column, shares, multipliers, limits) of
+        each limit, see :func:`jumplab.ocp.posing.binding`.
         """
         a, posed, _ = self._posed(asked, solved)
         return binding(a, posed, solved.solution.multipliers)
@@ -297,8 +297,8 @@ class Program(Shown):
     def references(
         self, srmp: SrmpPlan | None = None, motion: Motion | None = None
     ) -> dict[str, dict[str, np.ndarray]]:
-        """How high the soles of feet in the air shall be at each node (1, N + 1) [m], by phase and
-        foot; with tracking also stage 1's trajectories, or the given motion, by share of each
+        """References at each node (1, N + 1) by phase: heights of the soles of feet in the air [m],
+        by foot; with tracking also stage 1's trajectories, or the given motion, by share of each
         phase.
         """
         phases = self.contacts.phases

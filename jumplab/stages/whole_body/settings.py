@@ -15,7 +15,7 @@ RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserv
 
 @dataclass(frozen=True)
 class Limits:
-    """What a plan may use of the robot and the ground."""
+    """Limits of robot and ground that a plan keeps."""
 
     torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
     speed_share: float = 0.90  # of the speed limit

@@ -1,4 +1,4 @@
-"""Where a solve of the whole-body program begins: lists of starts, each with its patience."""
+"""Starts of a solve of the whole-body program: lists of them, each with its patience."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Beginning:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of one start; of those that are compared also their plans (None of others).
+    """Outcome of one start; of those that are compared also their plans (None of others).
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Asked:
-    """What every solve of one target is asked for, whatever its program and its start.
+    """Request that is the same for every solve of one target, whatever its program and its start.
 
     Attributes
     ----------

@@ -130,9 +130,7 @@ def feet_of(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _travel(robot: Robot, origin: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:
-    """How far the middle between the soles moves (3,) [m], and by how much the feet turn about the
-    vertical [rad].
-    """
+    """Travel of the soles' middle (3,) [m], and turn of the feet about the vertical [rad]."""
     middle = (origin + turn @ robot.foot.center)[[0, -1]].mean(axis=1)
     left = turn[..., 1].sum(axis=1)  # it stays level in a flip, too
     turned = np.unwrap(np.arctan2(-left[:, 0], left[:, 1]))
@@ -142,7 +140,7 @@ def _travel(robot: Robot, origin: np.ndarray, turn: np.ndarray) -> dict[str, np.
 def _joining(
     before: Sequence[np.ndarray], after: Sequence[np.ndarray], t: np.ndarray, most_s: float
 ) -> Motion:
-    """What to add to a motion (n, k) on three levels that begins at ``after`` (k,) each, so that it
+    """Motion (n, k) on three levels to add to one that begins at ``after`` (k,) each, so that it
     begins at ``before`` and is itself again after :data:`JOINING_S`, ``most_s`` at the latest;
     ``t`` (n,) since then [s].
     """
@@ -259,9 +257,9 @@ def _balanced(
     """The motion, its base moved by some micrometres so that the ground's force is what is planned.
 
     Where all feet that carry are on their toes, in one ``line``, no ground force has a moment about
-    it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides
-    the planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. What
-    a phase moves the base by goes within the phase if it ``stays`` on the ground.
+    it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides the
+    planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. The
+    shift of the base in a phase vanishes within it if the phase ``stays`` on the ground.
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
@@ -489,8 +487,9 @@ def forces(
     """Wrenches (n, 2, 6) at the origins of the ``feet``, motor torques, and by name CoM with
     velocity (n, 3) and L about the CoM (n, 3).
 
-    What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the world's origin is shared out
-    by load among the feet that carry, by ``contacts`` (n, 2); ``feet`` as of :func:`feet_of`.
+    The part of inverse dynamics that the ``wrench`` (n, 2, 6) about the world's origin lacks is
+    shared out by load among the feet that carry, by ``contacts`` (n, 2); ``feet`` as of
+    :func:`feet_of`.
     """
     model = robot.model
     data = model.createData()
@@ -531,8 +530,8 @@ def forces(
 def _shared(
     wrench: np.ndarray, soles: np.ndarray, contacts: np.ndarray, missing: np.ndarray, least: float
 ) -> np.ndarray:
-    """What each foot (n, 2, 6) adds of ``missing`` (n, 6) about the origin: by its load, forces at
-    its centre of pressure, which without load is the middle of its sole (n, 2, 3) [m].
+    """Share of each foot (n, 2, 6) in the ``missing`` (n, 6) about the origin: by its load, forces
+    at its centre of pressure, which without load is the middle of its sole (n, 2, 3) [m].
     """
     lift = wrench[..., 2:3]
     pressed = np.stack([-wrench[..., 4], wrench[..., 3], 0 * wrench[..., 2]], -1)

@@ -508,7 +508,9 @@ def ankle_stroke(m: Mode) -> list[Term]:
 
 
 def capture_rows(m: Mode) -> list[Term]:
-    """Where soles meet the ground, so that the robot can be caught; of a flip by its momentum."""
+    """Constraint on where soles meet the ground, so that the robot can be caught; of a flip, on its
+    momentum.
+    """
     lim = m.limits
     if lim.capture_moment is not None:
         return flip_capture_in_plane(m) if m.free.plane else [flip_capture(m)]

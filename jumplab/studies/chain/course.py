@@ -1,5 +1,5 @@
-"""What a chain of jumps shall achieve: how far each time, how high, onto what; and the ground that
-belongs to it.
+"""Course of a chain of jumps: distance, height and platform of each; and the ground that belongs to
+it.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def crouched(robot: Robot) -> Robot:
 
 
 def placed(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Where a ``step`` (3,) leads from a ``pose`` (3,): x, y [m] and heading [rad]; the step is as
-    seen from there.
+    """Pose after a ``step`` (3,) from a ``pose`` (3,): x, y [m] and heading [rad]; the step is as
+    seen from the first pose.
     """
     return pose + pin.rpy.rpyToMatrix(0.0, 0.0, pose[2]) @ step
 
@@ -169,7 +169,7 @@ class Course:
         """Raise :class:`InputError` if a platform overlaps with a place (see :attr:`goals`) where
         the robot stands.
 
-        Between two places of different height both soles need room beside the edge; see
+        Between two places of different height both soles need space beside the edge; see
         :func:`platform_edge_m`.
         """
         if not any(self.platforms_m):

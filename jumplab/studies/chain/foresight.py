@@ -84,7 +84,7 @@ class Ahead:
 
     @property
     def foretold_m(self) -> float:
-        """How far ahead the feet were foretold [m]."""
+        """Predicted place of the feet ahead [m]."""
         return float(self.foretold[0])
 
     @property
@@ -94,7 +94,7 @@ class Ahead:
 
     @property
     def bias_m(self) -> float:
-        """What was added to the distance [m]."""
+        """Correction that was added to the distance [m]."""
         return float(self.bias[0])
 
     @property
@@ -104,8 +104,8 @@ class Ahead:
 
     @property
     def spare_s(self) -> float | None:
-        """How long before it was needed it was there [s]; negative if late, None if it was never
-        needed.
+        """Time from the arrival of the plan until it was needed [s]; negative if it was late, None
+        if it was never needed.
         """
         return None if self.needed_s is None else self.needed_s - self.ready_s
 

@@ -1,4 +1,4 @@
-"""Who commands in a chain: the standing controller between jumps, one jump's pilot after the other,
+"""Pilot of a chain: the standing controller between jumps, one jump's controller after the other,
 and between them the plan of the next jump.
 """
 
@@ -91,7 +91,9 @@ class ChainPilot:
         return bool(self.reason) or (not self._further and watched)
 
     def drive(self, t: float, state: State) -> Drive:
-        """What the joints' drives are sent at ``t`` since the chain began [s], as measured."""
+        """Values to send to the joints' drives at ``t`` since the chain began [s], from the
+        measured ``state``.
+        """
         step = round(t / STEP_S)
         q, v, wrench = state
         if self._further and not self.reason:
@@ -262,8 +264,8 @@ def over_feet(tape: Tape, robot: Robot, q: np.ndarray) -> PPoly:
 
 
 def _standing(gauge: Gauge, q: np.ndarray) -> list[pin.SE3]:
-    """Where the feet stand along the ground in ``q`` (nq,), and their turns about the vertical,
-    seen from between both.
+    """Places of the feet along the ground in ``q`` (nq,), and their turns about the vertical, seen
+    from between both.
     """
     feet = gauge.places(headed(q, gauge.heading(q)))
     soles = np.array([foot.act(gauge.robot.foot.center) for foot in feet]) * [1.0, 1.0, 0.0]

@@ -97,7 +97,7 @@ class ChainResult:
 
     @property
     def errors_m(self) -> np.ndarray:
-        """(K,) where the feet stand after each jump less where the course wants them [m]; with
+        """(K,) places of the feet after each jump less those of the course [m]; with
         sides and turns how far off they are.
         """
         return self._along(self.feet[1:, :2] - self.course.goals[: len(self.jumps), :2])
@@ -107,7 +107,7 @@ class ChainResult:
 
     @property
     def heading_errors_rad(self) -> np.ndarray:
-        """(K,) where the feet point after each jump less where the course wants them to [rad]."""
+        """(K,) headings of the feet after each jump less those of the course [rad]."""
         errors = self.feet[1:, 3] - self.course.goals[: len(self.jumps), 2]
         return np.arctan2(np.sin(errors), np.cos(errors))
 
@@ -120,7 +120,7 @@ class ChainResult:
 
     @property
     def reason(self) -> str:
-        """Why the chain counts as failed; empty if it stood."""
+        """Reason why the chain counts as failed; empty if it stood."""
         if self.interrupted:
             return self.interrupted
         if len(self.jumps) < self.course.count:
@@ -151,14 +151,12 @@ class ChainResult:
 
     @property
     def in_time(self) -> int:
-        """How many of the :attr:`replans` were there when the robot was ready for them."""
+        """Number of the :attr:`replans` that were there when the robot was ready for them."""
         return sum(a.in_time for a in self.replans)
 
     @property
     def waits_s(self) -> tuple[float, ...]:
-        """How long the robot, still enough, waited for a plan before each jump but the first
-        [s].
-        """
+        """Waits of the robot, still enough, for a plan before each jump but the first [s]."""
         begun = (j.ahead for j in self.jumps[1:] if j.ahead)
         return tuple(ahead.began_s - ahead.needed_s for ahead in begun)
 

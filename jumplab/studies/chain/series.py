@@ -78,9 +78,9 @@ def row(seed: int, result: ChainResult) -> Plain:
 
 
 def counts(rows: Sequence[Plain]) -> Plain:
-    """How many robots stood to the end (with Wilson's 95 % interval of their share), how many plans
-    were made on the way and were there when they were needed, how many jumps began without waiting
-    for one, and the largest error of those that stood [m].
+    """Numbers of robots that stood to the end (with Wilson's 95 % interval of their share), of
+    plans that were made on the way and were there when they were needed, and of jumps that began
+    without waiting for a plan; and the largest error of the robots that stood [m].
     """
     stood = [x for x in rows if x["stood"]]
     spare_s = [plan["spare_s"] for x in rows for plan in x["plans"]]
