@@ -15,6 +15,9 @@ from jumplab.robot_import.urdf import Joint, Tree, numbers, placed
 from jumplab.robot_import.write import listed
 
 # None of these numbers is printed by the paper.
+LEANS_RAD = np.pi / 2  # that a foot is looked for level, in such steps
+STEP_RAD = np.pi / 180
+PITCH = 0.9  # cosine between the axis of an ankle and the lateral one
 STANDS = 0.1  # sine: a cylinder that leans by less than 6 deg stands on its end
 # shares of the leg's length: shapes smaller than this are markers or points, no soles; and what is
 # so little above the lowest point belongs to the sole, at most SOLE_M
@@ -59,13 +62,9 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
         return Sole(x, y, leg_m * GUESS_Z, source)
     source = f"from its {' and '.join(sorted(kinds))}"
     least = SMALLEST * leg_m
+    if np.ptp(touching[:, 0]) < least:
+        _refuse_lean(tree, foot, turn, leg_m)
     if max(np.ptp(touching[:, :2], axis=0)) < least:
-        _, whole, _ = sole_points(tree, foot, turn, np.inf)
-        if max(np.ptp(whole[:, :2], axis=0)) > 3 * least:
-            raise tree.error(
-                f"with all joints at 0 the foot {foot!r} leans, and touches level ground in a "
-                f"point; give it a shape whose lower side is level in that pose, such as a box"
-            )
         wide = 1e3 * max(np.ptp(around[:, :2], axis=0))
         raise tree.error(
             f"the foot {foot!r} touches the ground in a point ({source}, {wide:.0f} mm wide): it "
@@ -78,6 +77,31 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
         ends.append((float(points[:, axis].min()), float(points[:, axis].max())))
         source += ", whose round side counts as level" if points is around else ""
     return Sole(*ends, float(touching[:, 2].min()), source)
+
+
+def _refuse_lean(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> None:
+    """Raise if a foot stands on its heel or toes with all joints at 0, and would be level on more
+    of its length if its ankle turned.
+    """
+    _, points, _ = sole_points(tree, foot, turn, np.inf)
+    found = {}  # angle -> length that touches [m]
+    for angle in sorted(np.arange(-LEANS_RAD, LEANS_RAD, STEP_RAD), key=abs):
+        turned = points @ pin.rpy.rpyToMatrix(0.0, angle, 0.0).T
+        low = turned[:, 2] < turned[:, 2].min() + thickness(leg_m)
+        found[angle] = np.ptp(turned[low, 0])
+    best = max(found, key=found.get)
+    if found[best] <= 3 * SMALLEST * leg_m:
+        return
+    left = turn[1]
+    cosines = {j: left @ tree.pose[j.child].rotation @ j.axis for j in tree.chain(foot) if j.driven}
+    ankle = [joint for joint, cosine in cosines.items() if abs(cosine) > PITCH][-1]
+    by = best * np.sign(cosines[ankle])
+    raise tree.error(
+        f"with all joints at 0 the foot {foot!r} stands on its {'toes' if best < 0 else 'heel'}, "
+        f"{abs(np.degrees(best)):.0f} deg from level, and jumps are planned from a level one; let "
+        f"joint {ankle.name!r} count from there: turn its frame by {by:.3g} rad about its axis, "
+        f"and shift its range by {-by:.3g}"
+    )
 
 
 def thickness(leg_m: float) -> float:

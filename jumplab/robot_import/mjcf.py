@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -29,10 +30,15 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed, shifted
 
 ON_JOINT = [*map(int, (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPARENT))]
+TIES = [*map(int, (EQUALITY.mjEQ_CONNECT, EQUALITY.mjEQ_WELD))]  # of bodies: closed chains
 # an activation of these is no larger than the control
 PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT))]
 LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
 UNNAMED = "MuJoCo Model"
+MOST_MESHES = 100  # of which hulls are made in a second
+# elements of settings, in which an attribute that another MuJoCo knows is no part of the robot
+SETTINGS = ("option", "flag", "size", "global", "quality", "map", "headlight", "statistic", "key")
+UNKNOWN = re.compile(r"unrecognized attribute: '(\w+)'; Element '(\w+)'")
 # names of files that say nothing of the robot in them
 GENERIC = re.compile(r"(?i)[ _-]*\b(scene|robot|model|main|mjcf|mjx)\b[ _-]*|^scene[ _-]")
 
@@ -44,7 +50,7 @@ def as_description(path: Path, text: str) -> str:
     ``text`` is what the file holds. Links between several joints of one body have no mass.
     """
     notes = []
-    spec = _spec(path, text)
+    spec = _spec(path, text, notes)
     model = _compiled(spec, path, notes)
     root = _robot_of(model, path.name, notes)
     xml = ET.Element("robot", name=_name(spec, path, text), format="MJCF")
@@ -60,20 +66,36 @@ def as_description(path: Path, text: str) -> str:
 
 # reading
 # --------------------------------------------------------------------------------------------------
-def _spec(path: Path, text: str) -> mujoco.MjSpec:
-    """MuJoCo's own reading of a file, whatever it is called."""
+def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
+    """MuJoCo's own reading of a file, whatever it is called; settings that this MuJoCo does not
+    know are left out.
+    """
     # MuJoCo would write its warnings into a file of the working folder
     mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
-    try:
-        # MuJoCo reads only files that are called so; what they include may lie in other folders
-        if path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64]):
-            return mujoco.MjSpec.from_file(str(path))
-        included = {name: inner.encode() for name, inner in _included(path.parent, text)}
-        spec = mujoco.MjSpec.from_string(text, include=included)
-        spec.modelfiledir = f"{path.parent}/"
-        return spec
-    except (ValueError, mujoco.FatalError, OSError) as e:
-        raise RobotError(f"{path.name}: MuJoCo cannot read this MJCF file: {_sentence(e)}") from e
+    texts = dict(_included(path.parent, text))
+    # MuJoCo reads only files that are called so; what they include may lie in other folders
+    plain = path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64])
+    while True:
+        try:
+            if plain:
+                return mujoco.MjSpec.from_file(str(path))
+            included = {name: inner.encode() for name, inner in texts.items()}
+            spec = mujoco.MjSpec.from_string(text, include=included)
+            spec.modelfiledir = f"{path.parent}/"
+            return spec
+        except (ValueError, mujoco.FatalError, OSError) as e:
+            sentence = _sentence(e)
+            found = UNKNOWN.search(sentence)
+            if found is None or found[2] not in SETTINGS:
+                raise RobotError(
+                    f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
+                ) from e
+            key, tag = found.groups()
+            given = re.compile(rf"(<{tag}\b[^>]*?)\s{key}\s*=\s*([\"']).*?\2", re.DOTALL)
+            text, *inner = (given.sub(r"\1", x) for x in (text, *texts.values()))
+            texts = dict(zip(texts, inner, strict=True))
+            plain = False
+            notes.append(f"<{tag}> has {key!r}, which this MuJoCo does not know: left out")
 
 
 def _included(folder: Path, text: str) -> Iterator[tuple[str, str]]:
@@ -87,7 +109,8 @@ def _included(folder: Path, text: str) -> Iterator[tuple[str, str]]:
 
 def _sentence(e: Exception) -> str:
     """MuJoCo's complaint in a line, with the element that it names."""
-    return "; ".join(line.strip() for line in str(e).splitlines() if line.strip())
+    sentence = "; ".join(line.strip() for line in str(e).splitlines() if line.strip())
+    return sentence + ("; give the body an <inertial>" if "mjMINVAL" in sentence else "")
 
 
 def _name(spec: mujoco.MjSpec, path: Path, text: str) -> str:
@@ -112,9 +135,11 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
     terrain = [g for g in spec.geoms if int(g.type) == GEOM.mjGEOM_HFIELD]
     for part in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
         part.material = ""
-    for part in [*pictures, *terrain, *spec.hfields]:
+    for part in [*pictures, *terrain, *spec.hfields, *_pairs_with_others(spec, notes)]:
         spec.delete(part)
     spec.compiler.fusestatic = spec.compiler.discardvisual = False
+    if len(spec.meshes) > MOST_MESHES:
+        _spare_meshes(spec, notes)
     while True:
         try:
             return spec.compile()
@@ -126,6 +151,46 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
                     f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
                 ) from e
             _leave_out(spec, mesh, path, notes)
+
+
+def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Make points of the meshes that are of no foot and weigh nothing: MuJoCo takes a minute for
+    the hulls of a thousand.
+    """
+    ends = {body.name for body in spec.bodies if not list(body.bodies)}
+    # of a foot with toes
+    ends |= {
+        b.parent.name for b in spec.bodies if b.name in ends and len(list(b.parent.bodies)) == 1
+    }
+    for geom in spec.geoms:
+        if geom.meshname and geom.parent.explicitinertial and geom.parent.name not in ends:
+            geom.type = GEOM.mjGEOM_SPHERE
+            geom.meshname = ""
+            geom.size = [1e-3, 0.0, 0.0]
+    used = {geom.meshname for geom in spec.geoms}
+    spared = [mesh for mesh in spec.meshes if mesh.name not in used]
+    for mesh in spared:
+        mesh.file = ""
+        mesh.uservert = np.vstack([np.zeros(3), np.eye(3)]).ravel()
+        mesh.userface = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
+    notes.append(f"{len(spared)} of {len(spec.meshes)} meshes, none of a foot, are not read")
+
+
+def _pairs_with_others(spec: mujoco.MjSpec, notes: list[str]) -> list[mujoco.MjsPair]:
+    """Contact pairs with a geom that is in another file, such as the scene's floor; the geoms that
+    are here are marked as such that touch.
+    """
+    here = {geom.name: geom for geom in spec.geoms}
+    found = {}
+    for pair in spec.pairs:
+        ends = pair.geomname1, pair.geomname2
+        if lost := [name for name in ends if name not in here]:
+            found[lost[0]] = [*found.get(lost[0], []), pair]
+            for name in {*ends} & {*here}:
+                here[name].contype = 1
+    if found:
+        notes.append(f"the pairs with {listed(found)}, which this file lacks, are left out")
+    return [pair for pairs in found.values() for pair in pairs]
 
 
 def _blamed(mesh: mujoco.MjsMesh, sentence: str) -> bool:
@@ -197,6 +262,42 @@ def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
     return ends
 
 
+@dataclass(frozen=True)
+class _Loop:
+    """A closed chain: its equality, the bodies that it ties, and hinges that no spring holds: on
+    the way to the one and to the other.
+    """
+
+    name: str
+    ends: tuple[int, int]
+    ways: list[list[int]]
+
+    @property
+    def joints(self) -> list[int]:
+        """The hinges on both ways, by number."""
+        return sorted(k for way in self.ways for k in way)
+
+
+def _loops(model: mujoco.MjModel) -> Iterator[_Loop]:
+    hinges = (model.jnt_type == JOINT.mjJNT_HINGE) & (model.jnt_stiffness == 0)
+    for e in np.flatnonzero(model.eq_active0):
+        if model.eq_type[e] in TIES:
+            ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+            if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+                ends = tuple(int(model.site_bodyid[x]) for x in ends)
+            one, two = ({*_up(model, body)} for body in ends)
+            ways = [np.isin(model.jnt_bodyid, [*way]) & hinges for way in (one - two, two - one)]
+            name = model.equality(e).name or str(e)
+            yield _Loop(name, ends, [np.flatnonzero(way).tolist() for way in ways])
+
+
+def _up(model: mujoco.MjModel, body: int) -> Iterator[int]:
+    """A body and all that carry it."""
+    while body:
+        yield body
+        body = int(model.body_parentid[body])
+
+
 class _Motors:
     """What the actuators of a model do for its degrees of freedom (nv)."""
 
@@ -210,11 +311,21 @@ class _Motors:
         self.others = []  # actuators that are not counted
         for a in range(model.nu):
             self._add(model, a)
+        for loop in _loops(model):
+            # a chain that only holds another one, which goes on, gets no motor by that
+            on = [self._goes_on(model, end) for end in loop.ends]
+            for way, leads in zip(loop.ways, on, strict=True):
+                self.pulled[model.jnt_dofadr[way]] |= leads or not any(on)
         for k in np.flatnonzero(model.jnt_actfrclimited):
             dof = model.jnt_dofadr[k]
             given = self.torque[dof] if self.driven[dof] else [-np.inf, np.inf]
             self.torque[dof] = np.clip(given, *model.jnt_actfrcrange[k])
             self.driven[dof] = True
+
+    def _goes_on(self, model: mujoco.MjModel, end: int) -> bool:
+        """Whether a joint with a motor hangs on a body."""
+        bodies = model.jnt_bodyid[self.driven[model.jnt_dofadr]]
+        return any(end in _up(model, int(model.body_parentid[body])) for body in bodies)
 
     def _add(self, model: mujoco.MjModel, a: int) -> None:
         kind = model.actuator_trntype[a]
@@ -387,16 +498,18 @@ class _Writer:
             if kind == EQUALITY.mjEQ_JOINT:
                 if one in self.joints:
                     self._follow(name, one, other, model.eq_data[e, :5])
-            elif kind == EQUALITY.mjEQ_CONNECT or kind == EQUALITY.mjEQ_WELD:
-                sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
-                ends = [int(model.site_bodyid[x]) if sites else x for x in (one, other)]
-                tied = " to ".join(repr(model.body(x).name) for x in ends)
-                if set(ends) & set(self.bodies):
-                    self.notes.append(
-                        f"{name} ties {tied}: left out, the joints move as if it were cut"
-                    )
-            else:
+            elif kind not in TIES:
                 self.notes.append(f"{name} of tendons or flexes is left out")
+        for loop in _loops(model):
+            if set(loop.ends) & set(self.bodies):
+                tied = " to ".join(repr(model.body(x).name) for x in loop.ends)
+                cut = (
+                    f", the joints {self._joints(loop.joints)} of this closed chain move as if it "
+                    f"were cut; those of a leg without a motor need in [limits] the effort that "
+                    f"the chain gives them"
+                )
+                cut = cut if loop.joints else ""
+                self.notes.append(f"the equality {loop.name!r} ties {tied}: left out{cut}")
 
     def _follow(self, name: str, one: int, other: int, curve: np.ndarray) -> None:
         """The mimic of a joint that follows another, the one with a motor, along a line."""
