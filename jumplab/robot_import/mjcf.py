@@ -145,12 +145,12 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
             return spec.compile()
         except (ValueError, mujoco.FatalError) as e:
             sentence = _sentence(e)
-            mesh = next((m for m in spec.meshes if _blamed(m, sentence)), None)
-            if mesh is None:
+            lost = _lost(spec.meshes, sentence)
+            if not lost:
                 raise RobotError(
                     f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
                 ) from e
-            _leave_out(spec, mesh, path, notes)
+            _leave_out(spec, lost, path, notes)
 
 
 def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
@@ -193,18 +193,28 @@ def _pairs_with_others(spec: mujoco.MjSpec, notes: list[str]) -> list[mujoco.Mjs
     return [pair for pairs in found.values() for pair in pairs]
 
 
-def _blamed(mesh: mujoco.MjsMesh, sentence: str) -> bool:
-    """Whether MuJoCo complains of the file of a mesh: not there, or no mesh, such as a pointer that
-    Git LFS has not replaced.
+def _lost(meshes: Iterable[mujoco.MjsMesh], sentence: str) -> list[mujoco.MjsMesh]:
+    """Meshes of whose files MuJoCo complains: one that is no mesh, such as a pointer that Git LFS
+    has not replaced, or all of a folder that are not there.
     """
-    opening = "Error opening file" in sentence and f"{Path(mesh.file).name}'" in sentence
     reading = re.search(r"decoder|MSH file|vertices required", sentence)
-    return bool(mesh.file) and (opening or bool(reading and f"name '{mesh.name}'" in sentence))
+    opening = re.search(r"Error opening file '(.*?)'", sentence)
+    for mesh in meshes:
+        if mesh.file and reading and f"name '{mesh.name}'" in sentence:
+            return [mesh]
+        if mesh.file and opening and opening[1].endswith(mesh.file):
+            folder = Path(opening[1]).parent
+            beside = [m for m in meshes if Path(m.file).parent == Path(mesh.file).parent]
+            return [m for m in beside if m.file and not (folder / Path(m.file).name).is_file()]
+    return []
 
 
-def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: list[str]) -> None:
-    """Delete a mesh that is not there, and the geoms that show it; refused if they weigh."""
-    geoms = [g for g in spec.geoms if g.meshname == mesh.name]
+def _leave_out(
+    spec: mujoco.MjSpec, meshes: list[mujoco.MjsMesh], path: Path, notes: list[str]
+) -> None:
+    """Delete meshes that are not there, and the geoms that show them; refused if they weigh."""
+    files = {mesh.name: mesh.file for mesh in meshes}
+    geoms = [g for g in spec.geoms if g.meshname in files]
     low, high = spec.compiler.inertiagrouprange
     always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     for geom in geoms:
@@ -213,16 +223,19 @@ def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: lis
         if weighs and counts and low <= geom.group <= high and geom.parent.name != "world":
             raise RobotError(
                 f"{path.name}: body {geom.parent.name!r}: its mass and inertia are those of the "
-                f"mesh {mesh.file!r}, which is not there or cannot be read; put it into "
+                f"mesh {files[geom.meshname]!r}, which is not there or cannot be read; put it into "
                 f"{str(path.parent / spec.compiler.meshdir)!r}, or give the body an <inertial>"
             )
     names = {g.name for g in geoms if g.name}
     pairs = [pair for pair in spec.pairs if {pair.geomname1, pair.geomname2} & names]
     bodies = sorted({g.parent.name for g in geoms})
-    for part in [*pairs, *geoms, mesh]:
+    for part in [*pairs, *geoms, *meshes]:
         spec.delete(part)
     where = f" of {listed(bodies)}" if bodies else ""
-    notes.append(f"the mesh {mesh.file!r}{where} is not there or cannot be read: left out")
+    what = f"the mesh {listed(files.values())}{where} is"
+    if len(files) > 1:
+        what = f"the meshes {listed(files.values())}{where} are"
+    notes.append(f"{what} not there or cannot be read: left out")
 
 
 def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
