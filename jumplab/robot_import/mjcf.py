@@ -35,7 +35,8 @@ TIES = [*map(int, (EQUALITY.mjEQ_CONNECT, EQUALITY.mjEQ_WELD))]  # of bodies: cl
 PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT))]
 LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
 UNNAMED = "MuJoCo Model"
-MOST_MESHES = 100  # of which hulls are made in a second
+MOST_MESHES = 30  # of which hulls are made in a second
+MOST_TOES = 2  # joints that hang on a foot
 # elements of settings, in which an attribute that another MuJoCo knows is no part of the robot
 SETTINGS = ("option", "flag", "size", "global", "quality", "map", "headlight", "statistic", "key")
 UNKNOWN = re.compile(r"unrecognized attribute: '(\w+)'; Element '(\w+)'")
@@ -138,7 +139,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
     for part in [*pictures, *terrain, *spec.hfields, *_pairs_with_others(spec, notes)]:
         spec.delete(part)
     spec.compiler.fusestatic = spec.compiler.discardvisual = False
-    if len(spec.meshes) > MOST_MESHES:
+    if len(spec.meshes) > MOST_MESHES and not _always_from_geoms(spec):
         _spare_meshes(spec, notes)
     while True:
         try:
@@ -153,15 +154,17 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
             _leave_out(spec, lost, path, notes)
 
 
+def _always_from_geoms(spec: mujoco.MjSpec) -> bool:
+    """Whether geoms weigh although their body has an <inertial>."""
+    return spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+
+
 def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
     """Make points of the meshes that are of no foot and weigh nothing: MuJoCo takes a minute for
     the hulls of a thousand.
     """
-    ends = {body.name for body in spec.bodies if not list(body.bodies)}
-    # of a foot with toes
-    ends |= {
-        b.parent.name for b in spec.bodies if b.name in ends and len(list(b.parent.bodies)) == 1
-    }
+    below = {b.name: len(b.find_all("joint")) - len(list(b.joints)) for b in spec.bodies}
+    ends = {name for name, joints in below.items() if joints <= MOST_TOES}
     for geom in spec.geoms:
         if geom.meshname and geom.parent.explicitinertial and geom.parent.name not in ends:
             geom.type = GEOM.mjGEOM_SPHERE
@@ -216,7 +219,7 @@ def _leave_out(
     files = {mesh.name: mesh.file for mesh in meshes}
     geoms = [g for g in spec.geoms if g.meshname in files]
     low, high = spec.compiler.inertiagrouprange
-    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    always = _always_from_geoms(spec)
     for geom in geoms:
         weighs = geom.mass > 0 if np.isfinite(geom.mass) else geom.density > 0
         counts = always or not geom.parent.explicitinertial
