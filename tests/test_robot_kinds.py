@@ -255,7 +255,8 @@ def test_a_knee_moved_through_a_gear_has_the_motor_of_its_crank(put):
     assert told(path).actuators["left_knee"]["effort"] == 180
     crank = '<link name="{0}_crank"><inertial><mass value="0.1"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" '
     crank += 'iyz="0" izz="1e-4"/></inertial></link><joint name="{0}_crank" type="revolute">'
-    crank += '<parent link="{0}_hip_yaw_link"/><child link="{0}_crank"/><axis xyz="0 1 0"/><limit lower="0" upper="2" effort="60" velocity="9"/>'
+    crank += '<parent link="{0}_hip_yaw_link"/><child link="{0}_crank"/><axis xyz="0 1 0"/>'
+    crank += '<limit lower="0" upper="2" effort="60" velocity="9"/>'
     crank += '<dynamics friction="1"/></joint></robot>'
     text = URDF
     for side in ("left", "right"):
