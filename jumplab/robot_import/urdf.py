@@ -343,15 +343,13 @@ class Tree:
         _, factor, offset = joint.mimic
         if not (motor.driven and factor and joint.kind in ("revolute", "continuous")):
             return
-        ends = [factor * motor.limits.get(end, np.nan) + offset for end in ("lower", "upper")]
-        through = dict(zip(("lower", "upper"), sorted(ends), strict=True))
+        limit = joint.element.find("limit")
         for key, ratio in (("effort", 1 / factor), ("velocity", factor)):
-            through[key] = abs(ratio) * motor.limits.get(key, np.nan)
-            if joint.limits.get(key):
-                through[key] = min(through[key], joint.limits[key])
-        known = {key: float(x) for key, x in through.items() if np.isfinite(x)}
-        ranges = {end: x for end, x in joint.limits.items() if end in ("lower", "upper")}
-        joint.limits = known | ranges
+            joint.limits.pop(key, None)
+            if limit is not None:
+                limit.attrib.pop(key, None)
+            if key in motor.limits:
+                joint.limits[key] = abs(ratio) * motor.limits[key]
         for key, ratio in zip(OWN, (factor**-2, 1 / abs(factor), factor**-2), strict=True):
             if lost := joint.losses.get(key, 0.0) + ratio * motor.losses.get(key, 0.0):
                 joint.losses[key] = lost
