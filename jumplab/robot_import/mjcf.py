@@ -86,14 +86,17 @@ def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
             return spec
         except (ValueError, mujoco.FatalError, OSError) as e:
             sentence = _sentence(e)
-            found = UNKNOWN.search(sentence)
-            if found is None or found[2] not in SETTINGS:
+            before = [text, *texts.values()]
+            after = before
+            if (found := UNKNOWN.search(sentence)) and found[2] in SETTINGS:
+                key, tag = found.groups()
+                given = re.compile(rf"(<{tag}\b[^>]*?)\s{key}\s*=\s*([\"']).*?\2", re.DOTALL)
+                after = [given.sub(r"\1", x) for x in before]
+            if after == before:
                 raise RobotError(
                     f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
                 ) from e
-            key, tag = found.groups()
-            given = re.compile(rf"(<{tag}\b[^>]*?)\s{key}\s*=\s*([\"']).*?\2", re.DOTALL)
-            text, *inner = (given.sub(r"\1", x) for x in (text, *texts.values()))
+            text, *inner = after
             texts = dict(zip(texts, inner, strict=True))
             plain = False
             notes.append(f"<{tag}> has {key!r}, which this MuJoCo does not know: left out")
