@@ -321,7 +321,7 @@ class Tree:
         self.format = root.get("format", "URDF")
         self.where = where
         self.notes = []  # on files that were read on the way
-        self._meshes = {}  # (file name, scale) -> mesh
+        self._meshes = {}  # (file name, scale) -> mesh, or None
         self.path = path
         self.elements = {e.get("name"): e for e in root.findall("link")}
         self.joints = {e.get("name"): Joint.read(e) for e in root.findall("joint")}
@@ -460,7 +460,7 @@ class Tree:
     def _mesh(self, shape: ET.Element) -> coal.BVHModelBase | None:
         """A mesh from beside the URDF or above it; None if it is not there, or cannot be read."""
         key = shape.get("filename", ""), shape.get("scale", "1 1 1")
-        if key not in self._meshes:
+        if self._meshes.get(key) is None:
             self._meshes[key] = self._load(*key)
         return self._meshes[key]
 
