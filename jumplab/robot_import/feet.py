@@ -128,7 +128,7 @@ def sole_points(
                 at = axes * tree.pose[part] * place
                 if len(corners := tree.corners(shape)):
                     around.append(placed(at, corners))
-                    touching.append(_lowest(tree, shape, at))
+                    touching.append(_lowest(shape, corners, at))
                     kinds.add(shape.tag)
     ends = np.concatenate(touching)
     level = ends[:, 2].min(initial=np.inf) + thick_m
@@ -136,12 +136,12 @@ def sole_points(
     return *low, kinds
 
 
-def _lowest(tree: Tree, shape: ET.Element, place: pin.SE3) -> np.ndarray:
+def _lowest(shape: ET.Element, corners: np.ndarray, place: pin.SE3) -> np.ndarray:
     """(n, 3) points of a placed shape that may touch level ground: one of a sphere, two of a
-    capsule or of a cylinder that lies, else its corners.
+    capsule or of a cylinder that lies, else its ``corners`` (n, 3).
     """
     if not shape.get("radius"):
-        return placed(place, tree.corners(shape))
+        return placed(place, corners)
     radius = numbers(shape.get("radius"), 1)[0]
     length = 0.0 if shape.tag == "sphere" else numbers(shape.get("length"), 1)[0]
     along = place.rotation[:, 2]
@@ -149,7 +149,7 @@ def _lowest(tree: Tree, shape: ET.Element, place: pin.SE3) -> np.ndarray:
     if shape.tag == "cylinder":
         down = down - (down @ along) * along
         if np.linalg.norm(down) < STANDS:
-            return placed(place, tree.corners(shape))
+            return placed(place, corners)
         down = down / np.linalg.norm(down)
     ends = np.array([-0.5, 0.5]) if length else np.zeros(1)
     return place.translation + np.outer(ends * length, along) + radius * down
@@ -176,6 +176,7 @@ def _round(tree: Tree, shape: ET.Element, place: pin.SE3, axis: np.ndarray) -> b
     """
     level = pin.Quaternion.FromTwoVectors(axis, np.array([0.0, 1.0, 0.0])).toRotationMatrix()
     turns = [pin.rpy.rpyToMatrix(0.0, turn, 0.0) for turn in np.arange(0.0, 2 * np.pi, TURN_RAD)]
-    ways = [_lowest(tree, shape, pin.SE3(turn @ level, np.zeros(3)) * place) for turn in turns]
+    corners = tree.corners(shape)
+    ways = [_lowest(shape, corners, pin.SE3(turn @ level, np.zeros(3)) * place) for turn in turns]
     deep = [-way[:, 2].min(initial=0.0) for way in ways]
     return min(deep) > ROUND_SHARE * max(deep)

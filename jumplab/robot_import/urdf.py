@@ -321,7 +321,6 @@ class Tree:
         self.format = root.get("format", "URDF")
         self.where = where
         self.notes = []  # on files that were read on the way
-        self._meshes = {}  # (file name, scale) -> mesh, or None
         self.path = path
         self.elements = {e.get("name"): e for e in root.findall("link")}
         self.joints = {e.get("name"): Joint.read(e) for e in root.findall("joint")}
@@ -459,26 +458,20 @@ class Tree:
 
     def _mesh(self, shape: ET.Element) -> coal.BVHModelBase | None:
         """A mesh from beside the URDF or above it; None if it is not there, or cannot be read."""
-        key = shape.get("filename", ""), shape.get("scale", "1 1 1")
-        if self._meshes.get(key) is None:
-            self._meshes[key] = self._load(*key)
-        return self._meshes[key]
-
-    def _load(self, filename: str, scale: str) -> coal.BVHModelBase | None:
-        inside = filename.split("://", 1)[-1].lstrip("/")
+        inside = shape.get("filename", "").split("://", 1)[-1].lstrip("/")
         packages = filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))
         folders = [*(self.path.resolve().parents if self.path else ()), *map(Path, packages)]
         names = (inside, inside.split("/", 1)[-1])
         file = next((f / name for f in folders for name in names if (f / name).is_file()), None)
         if file is None:
             return None
-        factors = numbers(scale, 3)
+        scale = numbers(shape.get("scale", "1 1 1"), 3)
         loader = coal.MeshLoader(coal.BV_AABB)
         try:
-            mesh = loader.load(str(file), factors)
+            mesh = loader.load(str(file), scale)
             if np.abs(mesh.vertices()).max(initial=0.0) > MOST_MESH_M:
                 self.notes.append(f"the mesh {inside!r} is taken in millimetres")
-                mesh = loader.load(str(file), factors / 1000)
+                mesh = loader.load(str(file), scale / 1000)
             return mesh
         # a pointer to a mesh that was not downloaded, or a format of its own
         except (RuntimeError, ValueError):
