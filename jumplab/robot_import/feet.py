@@ -15,9 +15,9 @@ from jumplab.robot_import.urdf import Joint, Tree, numbers, placed
 from jumplab.robot_import.write import listed
 
 # None of these numbers is printed by the paper.
-LEANS_RAD = np.pi / 2  # that a foot is looked for level, in such steps
+LEANS_RAD = 1.3  # within which a foot is looked for level, in such steps; a shank lies beyond
 STEP_RAD = np.pi / 180
-PITCH = 0.9  # cosine between the axis of an ankle and the lateral one
+PITCH = 0.6  # cosine between the axis of an ankle and the lateral one
 STANDS = 0.1  # sine: a cylinder that leans by less than 6 deg stands on its end
 # shares of the leg's length: shapes smaller than this are markers or points, no soles; and what is
 # so little above the lowest point belongs to the sole, at most SOLE_M
