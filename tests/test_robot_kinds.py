@@ -290,7 +290,7 @@ def test_what_another_version_or_another_file_has_is_left_out(put):
     text = changed(MJCF, ("<worldbody>", f"{words}</contact><worldbody>"))
     path = put(text.replace(foot, named + marker, 1), "a.xml")
     assert "<option> has 'apirate', which this MuJoCo does not know: left out" in notes(path)
-    assert "the pairs with 'floor', which this file lacks, are left out" in notes(path)
+    assert "the pairs with 'floor', which is terrain or in another file, are left out" in notes(path)
     assert told(path).foot.heel == pytest.approx(-0.07)
     path = put(changed(MJCF, ("<worldbody>", '<worldbody><body stiff="9"/>')), "a.xml")
     assert "unrecognized attribute: 'stiff'; Element 'body'" in refused(lambda: draft(path))

@@ -139,8 +139,10 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
     terrain = [g for g in spec.geoms if int(g.type) == GEOM.mjGEOM_HFIELD]
     for part in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
         part.material = ""
-    for part in [*pictures, *terrain, *spec.hfields, *_pairs_with_others(spec, notes)]:
+    for part in [*pictures, *terrain, *spec.hfields]:
         spec.delete(part)
+    for pair in _pairs_with_others(spec, notes):
+        spec.delete(pair)
     spec.compiler.fusestatic = spec.compiler.discardvisual = False
     if len(spec.meshes) > MOST_MESHES and not _always_from_geoms(spec):
         _spare_meshes(spec, notes)
@@ -195,7 +197,9 @@ def _pairs_with_others(spec: mujoco.MjSpec, notes: list[str]) -> list[mujoco.Mjs
             for name in {*ends} & {*here}:
                 here[name].contype = 1
     if found:
-        notes.append(f"the pairs with {listed(found)}, which this file lacks, are left out")
+        notes.append(
+            f"the pairs with {listed(found)}, which is terrain or in another file, are left out"
+        )
     return [pair for pairs in found.values() for pair in pairs]
 
 
