@@ -104,7 +104,7 @@ def test_bad_input_in_one_sentence(capsys, argv, sentence):
 def test_all_faults_are_shown(capsys, tmp_path):
     (tmp_path / "my.urdf").write_text(GOOD.replace('mass value="5"', 'mass value="-5"'))
     code, out, err = quoted(capsys, "check", tmp_path / "my.urdf")
-    assert code == 2 and "left_thigh" in err and "(1 further faults are printed above)" in err and "right_thigh" in out
+    assert code == 2 and "left_thigh" in err and "(1 further fault is printed above)" in err and "right_thigh" in out
 
 
 def test_roles_are_told_in_spite_of_faults_and_limits_all_at_once(capsys, tmp_path):
@@ -116,7 +116,7 @@ def test_roles_are_told_in_spite_of_faults_and_limits_all_at_once(capsys, tmp_pa
     assert not (tmp_path / "out").exists()
     (tmp_path / "my.urdf").write_text(GOOD.replace('effort="210"', 'effort="1e9"'))
     code, out, err = quoted(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
-    assert code == 2 and "effort = 1e+09 N m is above 2000" in err and "(1 further faults are printed above)" in err
+    assert code == 2 and "effort = 1e+09 N m is above 2000" in err and "(1 further fault is printed above)" in err
     assert (tmp_path / "out" / "bhr.toml").is_file()  # there the limits are told
 
 

@@ -13,6 +13,7 @@ import pytest
 from fixtures_robots import refused
 
 from jumplab.robot.files import files_of
+from jumplab.robot_import import mjcf
 from jumplab.robot_import.checkup import check, examine
 from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import Tree, parse, read_urdf
@@ -220,6 +221,55 @@ def test_loops_and_couplings_are_named(put):
     assert "joint 'left_elbow' follows 'left_shoulder_pitch': held" in told_
 
 
+def rods(text: str, motor: str, equality: str) -> str:
+    """Knees without a motor, each with a rod that hangs on the thigh and has one."""
+    for side in ("left", "right"):
+        shank = f'<body name="{side}_knee_link" pos="0 0 -0.31">'
+        rod = f'<body name="{side}_rod" pos=".05 0 0"><joint name="{side}_crank" axis="0 1 0"/><inertial pos="0 0 -.1" '
+        rod += 'mass=".1" diaginertia=".001 .001 .0001"/></body>'
+        knee = f'<motor joint="{side}_knee" ctrlrange="-160 160"/>'
+        tie = equality.format(side=side)
+        text = changed(text, (shank, rod + shank), (knee, motor.format(side=side)))
+        text = changed(text, ("</worldbody>", f"</worldbody><equality>{tie}</equality>"))
+    return text
+
+
+CRANK = '<motor joint="{side}_crank" ctrlrange="-90 90"/>'
+
+
+def test_a_knee_that_a_closed_chain_moves_needs_its_effort(put):
+    tie = '<connect name="{side}_bar" body1="{side}_rod" body2="{side}_knee_link" anchor="0 0 -.31"/>'
+    path = put(rods(MJCF, CRANK, tie), "a.xml")
+    found = draft(path)
+    assert found.roles.joints["knee"] == ("left_knee", "right_knee")
+    assert "the joints 'left_crank', 'left_knee' of this closed chain move as if it were cut" in notes(path)
+    assert sum("give effort, velocity in [limits.left_knee]" in sentence for sentence in found.faults) == 1
+    given = TOLD.replace("[limits.knee]", "[limits.knee]\neffort = 120.0")
+    assert check(path, found.text + given).robot.actuators["left_knee"]["effort"] == 120
+
+
+def test_a_knee_moved_through_a_gear_has_the_motor_of_its_crank(put):
+    tie = '<joint joint1="{side}_knee" joint2="{side}_crank" polycoef="0 .5 0 0 0"/>'
+    path = put(rods(MJCF, CRANK, tie), "a.xml")
+    assert "joint 'left_knee' is moved by the motor of 'left_crank', by a gear of 0.5" in notes(path)
+    assert told(path).actuators["left_knee"]["effort"] == 180
+    servo = CRANK.replace("motor", "position").replace("90", "2")
+    faults = draft(put(rods(MJCF, servo, tie), "a.xml")).faults
+    assert any("has a forcerange" in x and "effort, velocity in [limits.left_knee]" in x for x in faults)
+    crank = '<link name="{0}_crank"><inertial><mass value="0.1"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" '
+    crank += 'iyz="0" izz="1e-4"/></inertial></link><joint name="{0}_crank" type="revolute">'
+    crank += '<parent link="{0}_hip_yaw_link"/><child link="{0}_crank"/><axis xyz="0 1 0"/>'
+    crank += '<limit lower="0" upper="2" effort="60" velocity="9"/>'
+    crank += '<dynamics friction="1"/></joint></robot>'
+    text = URDF
+    for side in ("left", "right"):
+        limits = re.search(rf'<joint name="{side}_knee".*?(<limit [^>]*/>)', text, re.DOTALL)
+        mimic = f'{limits[0]}<mimic joint="{side}_crank" multiplier="1.5"/>'
+        text = changed(text, (limits[0], mimic), ("</robot>", crank.format(side)))
+    knee = examine(put(text)).robot.actuators["left_knee"]
+    assert (knee["effort"], knee["speed"], knee["friction"]) == pytest.approx((40, 13.5, 2 / 3))
+
+
 def test_losses_of_the_file_are_those_of_the_motors(put):
     joint = ("<joint name=", '<joint armature=".02" damping=".5" frictionloss="1" name=')
     knee = told(put(changed(MJCF, joint), "a.xml")).actuators["left_knee"]
@@ -229,6 +279,33 @@ def test_losses_of_the_file_are_those_of_the_motors(put):
     assert examine(urdf).robot.actuators["left_knee"]["damping"] == 0.5
     assert "friction = '-1' of 'left_hip_pitch', 'left_knee', 'right_hip_pitch', 'right_knee' must be" in notes(urdf)
     assert "armature = " not in notes(urdf)
+
+
+def test_what_another_version_or_another_file_has_is_left_out(put):
+    """Settings that this MuJoCo does not know, and contact pairs with the floor of a scene."""
+    foot = '<geom type="box" pos="0.03 0 -0.05" size="0.1 0.04 0.015" mass="0"/>'
+    named = foot.replace("<geom", '<geom name="foot" contype="0" conaffinity="0"')
+    marker = '<geom size=".3" mass="0" contype="0" conaffinity="0"/>'
+    words = '<option apirate="9"><flag sensornoise="enable"/></option><contact><pair geom1="floor" geom2="foot"/>'
+    text = changed(MJCF, ("<worldbody>", f"{words}</contact><worldbody>"))
+    path = put(text.replace(foot, named + marker, 1), "a.xml")
+    assert "<option> has 'apirate', which this MuJoCo does not know: left out" in notes(path)
+    assert "the pairs with 'floor', which is terrain or in another file, are left out" in notes(path)
+    assert told(path).foot.heel == pytest.approx(-0.07)
+    path = put(changed(MJCF, ("<worldbody>", '<worldbody><body stiff="9"/>')), "a.xml")
+    assert "unrecognized attribute: 'stiff'; Element 'body'" in refused(lambda: draft(path))
+
+
+def test_of_many_meshes_those_of_the_feet_are_read(put, monkeypatch):
+    monkeypatch.setattr(mjcf, "MOST_MESHES", 1)
+    corners = " ".join(f"{x} {y} {z}" for x in (-0.07, 0.13) for y in (-0.04, 0.04) for z in (-0.065, -0.035))
+    assets = f'<asset><mesh name="foot" vertex="{corners}"/><mesh name="trunk" file="lost.stl"/></asset><worldbody>'
+    foot = '<geom type="box" pos="0.03 0 -0.05" size="0.1 0.04 0.015" mass="0"/>'
+    shown = '<freejoint/><geom type="mesh" mesh="trunk" mass="0"/>'
+    text = changed(MJCF, ("<worldbody>", assets), (foot, '<geom type="mesh" mesh="foot" mass="0"/>'))
+    path = put(changed(text, ("<freejoint/>", shown)), "a.xml")
+    assert "1 of 2 meshes, none of a foot, are not read" in notes(path)
+    assert told(path).foot.heel == pytest.approx(-0.07) and mass(path) == pytest.approx(30.8)
 
 
 def test_a_scene_is_called_after_its_robot(put):
@@ -307,6 +384,26 @@ def test_feet_that_are_points_and_legs_that_end_in_wheels(put):
         assert words in refused(lambda path=path: draft(path))
 
 
+def test_a_leaning_foot_is_levelled_as_advised(put):
+    """The ankle of a foot that leans by 0.2 rad with all joints at 0 is to count from where it is level."""
+    tilted = changed(URDF, ('<origin xyz="0.03 0 -0.05"/><', '<origin xyz="0 0 -.05" rpy="0 .2 0"/><'))
+    sentence = refused(lambda: draft(put(tilted)))
+    advice = r"stands on its toes, 11 deg .* joint 'left_ankle_pitch' .* by (\S+) rad about its axis, .* range by (\S+)"
+    turn, shift = map(float, re.search(advice, sentence).groups())
+    level = re.sub(r'(_ankle_pitch_link"/><origin xyz="[^"]*")', rf'\1 rpy="0 {turn} 0"', tilted)
+    level = changed(level, ('lower="-0.9" upper="0.7"', f'lower="{shift - 0.9}" upper="{shift + 0.7}"'))
+    robot = examine(put(level)).robot
+    assert robot.sagittal.upper[2] == pytest.approx(0.89, abs=0.02) and robot.foot.toe == pytest.approx(0.1, abs=0.02)
+
+
+def test_unlike_ranges_are_named_and_mended_as_advised(put):
+    path = put(re.sub(r'(<joint name="right_knee".*?)lower="0.0" upper="2.3"', r'\1lower="-2.3" upper="0"', URDF))
+    sentence = refused(lambda: examine(path))
+    assert "'left_knee', 'right_knee' turn 0 ... 2.3 and -2.3 ... 0 rad" in sentence and "0 rad in common" in sentence
+    given = "[limits.right_knee]\nlower = 0.0\nupper = 2.3"
+    assert check(path, draft(path).text + given).robot.sagittal.upper[1] == pytest.approx(2.3)
+
+
 def test_soles_from_what_is_drawn_and_from_millimetres(put):
     corners = np.array([[x, y, z] for x in (-70, 130) for y in (-40, 40) for z in (-65, -35)], float)
     facets = [(0, 1, 2), (1, 2, 3), (4, 5, 6), (5, 6, 7), (0, 1, 4), (1, 4, 5), (2, 3, 6), (3, 6, 7)]
@@ -343,6 +440,19 @@ def test_no_repair_mends_units(put):
     for repair in ((), ("inertia",)):
         sentence = refused(lambda repair=repair: draft(put(text), repair))
         assert "moment of inertia 40 kg m^2 on 1.8 kg is a radius of gyration of 4.71 m" in sentence
+
+
+def test_a_held_joint_may_share_its_name_with_a_link(put):
+    same = re.sub(r'"(left|right)_hand_link"', r'"\1_elbow"', URDF)
+    assert len(examine(put(same)).robot.joint_names) == 14
+
+
+def test_a_robot_whose_z_axis_points_down(put):
+    def turned(m: re.Match) -> str:
+        return f'{m[1]}="{m[2]} {-float(m[3]):g} {-float(m[4]):g}"'
+
+    found = draft(put(re.sub(r'(<origin xyz|<axis xyz)="(\S+) (\S+) (\S+)"', turned, URDF)))
+    assert (found.roles.up, found.roles.forward) == ("-z", "+x") and found.roles.joints["knee"][0] == "left_knee"
 
 
 def test_a_trunk_without_mass_is_refused(put):

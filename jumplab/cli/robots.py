@@ -114,7 +114,12 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
     """
     from jumplab.robot_import import checkup
 
-    draft, faults = checkup.first_look(urdf, repair)
+    try:
+        draft, faults = checkup.first_look(urdf, repair)
+    except RobotError as e:
+        for note in getattr(e, "__notes__", ()):
+            print(f"note: {note}")
+        raise
     path = None
     if draft:
         for note in draft.roles.notes:
@@ -129,7 +134,8 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
         print("".join(f"{sentence}\n" for sentence in others), end="")
         if path:
             print(f"comments in {path} list the missing data; check again with --config {path}")
-        above = f" ({len(others)} further faults are printed above)" if others else ""
+        more = "1 further fault is" if len(others) == 1 else f"{len(others)} further faults are"
+        above = f" ({more} printed above)" if others else ""
         raise RobotError(first + above)
     return draft
 

@@ -116,13 +116,21 @@ def notes(tree: Tree) -> Iterator[str]:
                 f"{gap:.2g} kg m^2 apart"
             )
     moving = [joint for joint in tree.joints.values() if joint.kind in MOVING]
+    followers = {}  # leader -> joints
     for joint in tree.joints.values():
         if joint.mimic:
-            yield f"joint {joint.name!r} follows {joint.mimic[0]!r}: held"
-    for joint in moving:
-        if joint.limits.get("effort") == 0:
-            yield f"joint {joint.name!r} has no motor (effort = 0): held"
+            followers.setdefault(joint.mimic[0], []).append(joint.name)
+    for leader, names in followers.items():
+        yield f"{_joints(names, 'follows', 'follow')} {leader!r}: held"
+    still = [joint.name for joint in moving if joint.limits.get("effort") == 0 and not joint.mimic]
+    if still:
+        yield f"{_joints(still, 'has', 'have')} no motor (effort = 0): held"
     yield from _losses(moving)
+
+
+def _joints(names: list[str], one: str, many: str) -> str:
+    """Names with a verb."""
+    return f"joint {names[0]!r} {one}" if len(names) == 1 else f"the joints {listed(names)} {many}"
 
 
 def _losses(moving: list[Joint]) -> Iterator[str]:

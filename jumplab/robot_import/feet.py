@@ -13,6 +13,9 @@ from jumplab.robot_import.urdf import Joint, Tree, numbers, placed
 from jumplab.robot_import.write import listed
 
 # None of these numbers is printed by the paper.
+LEANS_RAD = 1.3  # within which a foot is looked for level, in such steps; a shank lies beyond
+STEP_RAD = np.pi / 180
+PITCH = 0.6  # cosine between the axis of an ankle and the lateral one
 STANDS = 0.1  # sine: a cylinder that leans by less than 6 deg stands on its end
 # shares of the leg's length: shapes smaller than this are markers or points, no soles; and what is
 # so little above the lowest point belongs to the sole, at most SOLE_M
@@ -57,13 +60,9 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
         return Sole(x, y, leg_m * GUESS_Z, source)
     source = f"from its {' and '.join(sorted(kinds))}"
     least = SMALLEST * leg_m
+    if np.ptp(touching[:, 0]) < least:
+        _refuse_lean(tree, foot, turn, leg_m)
     if max(np.ptp(touching[:, :2], axis=0)) < least:
-        _, whole, _ = sole_points(tree, foot, turn, np.inf)
-        if max(np.ptp(whole[:, :2], axis=0)) > 3 * least:
-            raise tree.error(
-                f"with all joints at 0 the foot {foot!r} leans, and touches level ground in a "
-                f"point; give it a shape whose lower side is level in that pose, such as a box"
-            )
         wide = 1e3 * max(np.ptp(around[:, :2], axis=0))
         raise tree.error(
             f"the foot {foot!r} touches the ground in a point ({source}, {wide:.0f} mm wide): it "
@@ -76,6 +75,31 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
         ends.append((float(points[:, axis].min()), float(points[:, axis].max())))
         source += ", whose round side counts as level" if points is around else ""
     return Sole(*ends, float(touching[:, 2].min()), source)
+
+
+def _refuse_lean(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> None:
+    """Raise if a foot stands on its heel or toes with all joints at 0, and would be level on more
+    of its length if its ankle turned.
+    """
+    _, points, _ = sole_points(tree, foot, turn, np.inf)
+    found = {}  # angle -> length that touches [m]
+    for angle in sorted(np.arange(-LEANS_RAD, LEANS_RAD, STEP_RAD), key=abs):
+        turned = points @ pin.rpy.rpyToMatrix(0.0, angle, 0.0).T
+        low = turned[:, 2] < turned[:, 2].min() + thickness(leg_m)
+        found[angle] = np.ptp(turned[low, 0])
+    best = max(found, key=found.get)
+    if found[best] <= 3 * SMALLEST * leg_m:
+        return
+    left = turn[1]
+    cosines = {j: left @ tree.pose[j.child].rotation @ j.axis for j in tree.chain(foot) if j.driven}
+    ankle = [joint for joint, cosine in cosines.items() if abs(cosine) > PITCH][-1]
+    by = best * np.sign(cosines[ankle])
+    raise tree.error(
+        f"with all joints at 0 the foot {foot!r} stands on its {'toes' if best < 0 else 'heel'}, "
+        f"{abs(np.degrees(best)):.0f} deg from level, and jumps are planned from a level one; let "
+        f"joint {ankle.name!r} count from there: turn its frame by {by:.3g} rad about its axis, "
+        f"and shift its range by {-by:.3g}"
+    )
 
 
 def thickness(leg_m: float) -> float:
@@ -102,7 +126,7 @@ def sole_points(
                 at = axes * tree.pose[part] * place
                 if len(corners := tree.corners(shape)):
                     around.append(placed(at, corners))
-                    touching.append(_lowest(tree, shape, at))
+                    touching.append(_lowest(shape, corners, at))
                     kinds.add(shape.tag)
     ends = np.concatenate(touching)
     level = ends[:, 2].min(initial=np.inf) + thick_m
@@ -110,12 +134,12 @@ def sole_points(
     return *low, kinds
 
 
-def _lowest(tree: Tree, shape: ET.Element, place: pin.SE3) -> np.ndarray:
+def _lowest(shape: ET.Element, corners: np.ndarray, place: pin.SE3) -> np.ndarray:
     """(n, 3) points of a placed shape that may touch level ground: one of a sphere, two of a
-    capsule or of a cylinder that lies, else its corners.
+    capsule or of a cylinder that lies, else its ``corners`` (n, 3).
     """
     if not shape.get("radius"):
-        return placed(place, tree.corners(shape))
+        return placed(place, corners)
     radius = numbers(shape.get("radius"), 1)[0]
     length = 0.0 if shape.tag == "sphere" else numbers(shape.get("length"), 1)[0]
     along = place.rotation[:, 2]
@@ -123,7 +147,7 @@ def _lowest(tree: Tree, shape: ET.Element, place: pin.SE3) -> np.ndarray:
     if shape.tag == "cylinder":
         down = down - (down @ along) * along
         if np.linalg.norm(down) < STANDS:
-            return placed(place, tree.corners(shape))
+            return placed(place, corners)
         down = down / np.linalg.norm(down)
     ends = np.array([-0.5, 0.5]) if length else np.zeros(1)
     return place.translation + np.outer(ends * length, along) + radius * down
@@ -150,6 +174,7 @@ def _round(tree: Tree, shape: ET.Element, place: pin.SE3, axis: np.ndarray) -> b
     """
     level = pin.Quaternion.FromTwoVectors(axis, np.array([0.0, 1.0, 0.0])).toRotationMatrix()
     turns = [pin.rpy.rpyToMatrix(0.0, turn, 0.0) for turn in np.arange(0.0, 2 * np.pi, TURN_RAD)]
-    ways = [_lowest(tree, shape, pin.SE3(turn @ level, np.zeros(3)) * place) for turn in turns]
+    corners = tree.corners(shape)
+    ways = [_lowest(shape, corners, pin.SE3(turn @ level, np.zeros(3)) * place) for turn in turns]
     deep = [-way[:, 2].min(initial=0.0) for way in ways]
     return min(deep) > ROUND_SHARE * max(deep)

@@ -39,6 +39,7 @@ CAD_M = 0.005  # of places, and of a body's mass or inertia: what a CAD export l
 CAD_SHARE = 0.01
 LIGHT = 0.02  # of the robot's mass: in a lighter body differences count by as much less
 PAIR_M = 0.10  # farther apart two joints are no counterparts
+COMMON = 0.5  # of the narrower range, that left and right share at least
 SAME = 0.98  # cosine between a joint's axis and the mirror image of its counterpart's
 
 
@@ -130,6 +131,7 @@ def lump(
             f"the trunk {trunk!r} and all that is held on it weigh {bodies[0].inertia.mass:g} kg; "
             f"give its link a mass, or name another [source] trunk"
         )
+    _check_ranges(tree, bodies, roles)
     bodies = _with_mass(bodies, changed)
     bodies = _mirrored(bodies, changed)
     return Lumped({b.name: b for b in bodies}, changed, held, links, placed)
@@ -189,6 +191,28 @@ def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str,
             leader, factor, offset = joint.mimic
             out[joint.name] = factor * out.get(leader, 0.0) + offset
     return {name: angle for name, angle in out.items() if angle and name not in moving}
+
+
+def _check_ranges(tree: Tree, bodies: list[Body], roles: RoleJoints) -> None:
+    """Raise if left and right of a role have little of their ranges in common."""
+    of = {body.joint: body for body in bodies}
+    for pair in roles.values():
+        ends = []  # about the axis to the left [rad]
+        for body in (of[name] for name in pair):
+            turned = np.sign(body.axis[1]) or 1.0
+            ends.append(sorted((turned * body.limits["lower"], turned * body.limits["upper"])))
+        if not ends:
+            continue
+        low, high = np.transpose(ends)
+        common = high.min() - low.max()
+        if common < COMMON * (high - low).min():
+            ranges = " and ".join(f"{a:.3g} ... {b:.3g}" for a, b in ends)
+            tables = " or ".join(f"[limits.{key(name)}]" for name in pair)
+            raise tree.error(
+                f"the joints {listed(pair)} turn {ranges} rad about the axis to the left, which "
+                f"have {max(common, 0.0):.3g} rad in common: one has a wrong axis or range; "
+                f"correct it, or give its lower, upper in {tables}"
+            )
 
 
 def _told_limits(tree: Tree, config: dict, roles: RoleJoints) -> dict[str, dict[str, float]]:

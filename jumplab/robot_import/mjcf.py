@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -29,10 +30,16 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed, shifted
 
 ON_JOINT = [*map(int, (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPARENT))]
+TIES = [*map(int, (EQUALITY.mjEQ_CONNECT, EQUALITY.mjEQ_WELD))]  # of bodies: closed chains
 # an activation of these is no larger than the control
 PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT))]
 LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
 UNNAMED = "MuJoCo Model"
+MOST_MESHES = 30  # of which hulls are made in a second
+MOST_TOES = 2  # joints that hang on a foot
+# elements of settings, in which an attribute that another MuJoCo knows is no part of the robot
+SETTINGS = ("option", "flag", "size", "global", "quality", "map", "headlight", "statistic", "key")
+UNKNOWN = re.compile(r"unrecognized attribute: '(\w+)'; Element '(\w+)'")
 # names of files that say nothing of the robot in them
 GENERIC = re.compile(r"(?i)[ _-]*\b(scene|robot|model|main|mjcf|mjx)\b[ _-]*|^scene[ _-]")
 
@@ -44,7 +51,7 @@ def as_description(path: Path, text: str) -> str:
     ``text`` is what the file holds. Links between several joints of one body have no mass.
     """
     notes = []
-    spec = _spec(path, text)
+    spec = _spec(path, text, notes)
     model = _compiled(spec, path, notes)
     root = _robot_of(model, path.name, notes)
     xml = ET.Element("robot", name=_name(spec, path, text), format="MJCF")
@@ -60,20 +67,39 @@ def as_description(path: Path, text: str) -> str:
 
 # reading
 # --------------------------------------------------------------------------------------------------
-def _spec(path: Path, text: str) -> mujoco.MjSpec:
-    """MuJoCo's own reading of a file, whatever it is called."""
+def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
+    """MuJoCo's own reading of a file, whatever it is called; settings that this MuJoCo does not
+    know are left out.
+    """
     # MuJoCo would write its warnings into a file of the working folder
     mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
-    try:
-        # MuJoCo reads only files that are called so; what they include may lie in other folders
-        if path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64]):
-            return mujoco.MjSpec.from_file(str(path))
-        included = {name: inner.encode() for name, inner in _included(path.parent, text)}
-        spec = mujoco.MjSpec.from_string(text, include=included)
-        spec.modelfiledir = f"{path.parent}/"
-        return spec
-    except (ValueError, mujoco.FatalError, OSError) as e:
-        raise RobotError(f"{path.name}: MuJoCo cannot read this MJCF file: {_sentence(e)}") from e
+    texts = dict(_included(path.parent, text))
+    # MuJoCo reads only files that are called so; what they include may lie in other folders
+    plain = path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64])
+    while True:
+        try:
+            if plain:
+                return mujoco.MjSpec.from_file(str(path))
+            included = {name: inner.encode() for name, inner in texts.items()}
+            spec = mujoco.MjSpec.from_string(text, include=included)
+            spec.modelfiledir = f"{path.parent}/"
+            return spec
+        except (ValueError, mujoco.FatalError, OSError) as e:
+            sentence = _sentence(e)
+            before = [text, *texts.values()]
+            after = before
+            if (found := UNKNOWN.search(sentence)) and found[2] in SETTINGS:
+                key, tag = found.groups()
+                given = re.compile(rf"(<{tag}\b[^>]*?)\s{key}\s*=\s*([\"']).*?\2", re.DOTALL)
+                after = [given.sub(r"\1", x) for x in before]
+            if after == before:
+                raise RobotError(
+                    f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
+                ) from e
+            text, *inner = after
+            texts = dict(zip(texts, inner, strict=True))
+            plain = False
+            notes.append(f"<{tag}> has {key!r}, which this MuJoCo does not know: left out")
 
 
 def _included(folder: Path, text: str) -> Iterator[tuple[str, str]]:
@@ -87,7 +113,8 @@ def _included(folder: Path, text: str) -> Iterator[tuple[str, str]]:
 
 def _sentence(e: Exception) -> str:
     """MuJoCo's complaint in a line, with the element that it names."""
-    return "; ".join(line.strip() for line in str(e).splitlines() if line.strip())
+    sentence = "; ".join(line.strip() for line in str(e).splitlines() if line.strip())
+    return sentence + ("; give the body an <inertial>" if "mjMINVAL" in sentence else "")
 
 
 def _name(spec: mujoco.MjSpec, path: Path, text: str) -> str:
@@ -114,50 +141,111 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
         part.material = ""
     for part in [*pictures, *terrain, *spec.hfields]:
         spec.delete(part)
+    for pair in _pairs_with_others(spec, notes):
+        spec.delete(pair)
     spec.compiler.fusestatic = spec.compiler.discardvisual = False
+    if len(spec.meshes) > MOST_MESHES and not _always_from_geoms(spec):
+        _spare_meshes(spec, notes)
     while True:
         try:
             return spec.compile()
         except (ValueError, mujoco.FatalError) as e:
             sentence = _sentence(e)
-            mesh = next((m for m in spec.meshes if _blamed(m, sentence)), None)
-            if mesh is None:
+            lost = _lost(spec.meshes, sentence)
+            if not lost:
                 raise RobotError(
                     f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
                 ) from e
-            _leave_out(spec, mesh, path, notes)
+            _leave_out(spec, lost, path, notes)
 
 
-def _blamed(mesh: mujoco.MjsMesh, sentence: str) -> bool:
-    """Whether MuJoCo's message is about the file of this mesh: it is missing, or it is no mesh (a
-    pointer that Git LFS has not replaced, for example).
+def _always_from_geoms(spec: mujoco.MjSpec) -> bool:
+    """Whether geoms weigh although their body has an <inertial>."""
+    return spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+
+
+def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Make points of the meshes that are of no foot and weigh nothing: MuJoCo takes a minute for
+    the hulls of a thousand.
     """
-    opening = "Error opening file" in sentence and f"{Path(mesh.file).name}'" in sentence
+    below = {b.name: len(b.find_all("joint")) - len(list(b.joints)) for b in spec.bodies}
+    ends = {name for name, joints in below.items() if joints <= MOST_TOES}
+    for geom in spec.geoms:
+        if geom.meshname and geom.parent.explicitinertial and geom.parent.name not in ends:
+            geom.type = GEOM.mjGEOM_SPHERE
+            geom.meshname = ""
+            geom.size = [1e-3, 0.0, 0.0]
+    used = {geom.meshname for geom in spec.geoms}
+    spared = [mesh for mesh in spec.meshes if mesh.name not in used]
+    for mesh in spared:
+        mesh.file = ""
+        mesh.uservert = np.vstack([np.zeros(3), np.eye(3)]).ravel()
+        mesh.userface = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
+    notes.append(f"{len(spared)} of {len(spec.meshes)} meshes, none of a foot, are not read")
+
+
+def _pairs_with_others(spec: mujoco.MjSpec, notes: list[str]) -> list[mujoco.MjsPair]:
+    """Contact pairs with a geom that is in another file, such as the scene's floor; the geoms that
+    are here are marked as such that touch.
+    """
+    here = {geom.name: geom for geom in spec.geoms}
+    found = {}
+    for pair in spec.pairs:
+        ends = pair.geomname1, pair.geomname2
+        if lost := [name for name in ends if name not in here]:
+            found[lost[0]] = [*found.get(lost[0], []), pair]
+            for name in {*ends} & {*here}:
+                here[name].contype = 1
+    if found:
+        notes.append(
+            f"the pairs with {listed(found)}, which is terrain or in another file, are left out"
+        )
+    return [pair for pairs in found.values() for pair in pairs]
+
+
+def _lost(meshes: Iterable[mujoco.MjsMesh], sentence: str) -> list[mujoco.MjsMesh]:
+    """Meshes of whose files MuJoCo complains: one that is no mesh, such as a pointer that Git LFS
+    has not replaced, or all of a folder that are not there.
+    """
     reading = re.search(r"decoder|MSH file|vertices required", sentence)
-    return bool(mesh.file) and (opening or bool(reading and f"name '{mesh.name}'" in sentence))
+    opening = re.search(r"Error opening file '(.*?)'", sentence)
+    for mesh in meshes:
+        if mesh.file and reading and f"name '{mesh.name}'" in sentence:
+            return [mesh]
+        if mesh.file and opening and opening[1].endswith(mesh.file):
+            folder = Path(opening[1]).parent
+            beside = [m for m in meshes if Path(m.file).parent == Path(mesh.file).parent]
+            return [m for m in beside if m.file and not (folder / Path(m.file).name).is_file()]
+    return []
 
 
-def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: list[str]) -> None:
-    """Delete a mesh that is not there, and the geoms that show it; refused if they weigh."""
-    geoms = [g for g in spec.geoms if g.meshname == mesh.name]
+def _leave_out(
+    spec: mujoco.MjSpec, meshes: list[mujoco.MjsMesh], path: Path, notes: list[str]
+) -> None:
+    """Delete meshes that are not there, and the geoms that show them; refused if they weigh."""
+    files = {mesh.name: mesh.file for mesh in meshes}
+    geoms = [g for g in spec.geoms if g.meshname in files]
     low, high = spec.compiler.inertiagrouprange
-    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    always = _always_from_geoms(spec)
     for geom in geoms:
         weighs = geom.mass > 0 if np.isfinite(geom.mass) else geom.density > 0
         counts = always or not geom.parent.explicitinertial
         if weighs and counts and low <= geom.group <= high and geom.parent.name != "world":
             raise RobotError(
                 f"{path.name}: body {geom.parent.name!r}: its mass and inertia are those of the "
-                f"mesh {mesh.file!r}, which is not there or cannot be read; put it into "
+                f"mesh {files[geom.meshname]!r}, which is not there or cannot be read; put it into "
                 f"{str(path.parent / spec.compiler.meshdir)!r}, or give the body an <inertial>"
             )
     names = {g.name for g in geoms if g.name}
     pairs = [pair for pair in spec.pairs if {pair.geomname1, pair.geomname2} & names]
     bodies = sorted({g.parent.name for g in geoms})
-    for part in [*pairs, *geoms, mesh]:
+    for part in [*pairs, *geoms, *meshes]:
         spec.delete(part)
     where = f" of {listed(bodies)}" if bodies else ""
-    notes.append(f"the mesh {mesh.file!r}{where} is not there or cannot be read: left out")
+    what = f"the mesh {listed(files.values())}{where} is"
+    if len(files) > 1:
+        what = f"the meshes {listed(files.values())}{where} are"
+    notes.append(f"{what} not there or cannot be read: left out")
 
 
 def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
@@ -197,6 +285,42 @@ def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
     return ends
 
 
+@dataclass(frozen=True)
+class _Loop:
+    """A closed chain: its equality, the bodies that it ties, and hinges that no spring holds: on
+    the way to the one and to the other.
+    """
+
+    name: str
+    ends: tuple[int, int]
+    ways: list[list[int]]
+
+    @property
+    def joints(self) -> list[int]:
+        """The hinges on both ways, by number."""
+        return sorted(k for way in self.ways for k in way)
+
+
+def _loops(model: mujoco.MjModel) -> Iterator[_Loop]:
+    hinges = (model.jnt_type == JOINT.mjJNT_HINGE) & (model.jnt_stiffness == 0)
+    for e in np.flatnonzero(model.eq_active0):
+        if model.eq_type[e] in TIES:
+            ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+            if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+                ends = tuple(int(model.site_bodyid[x]) for x in ends)
+            one, two = ({*_up(model, body)} for body in ends)
+            ways = [np.isin(model.jnt_bodyid, [*way]) & hinges for way in (one - two, two - one)]
+            name = model.equality(e).name or str(e)
+            yield _Loop(name, ends, [np.flatnonzero(way).tolist() for way in ways])
+
+
+def _up(model: mujoco.MjModel, body: int) -> Iterator[int]:
+    """A body and all that carry it."""
+    while body:
+        yield body
+        body = int(model.body_parentid[body])
+
+
 class _Motors:
     """Effects of a model's actuators on its degrees of freedom (nv)."""
 
@@ -210,11 +334,21 @@ class _Motors:
         self.others = []  # actuators that are not counted
         for a in range(model.nu):
             self._add(model, a)
+        for loop in _loops(model):
+            # a chain that only holds another one, which goes on, gets no motor by that
+            on = [self._goes_on(model, end) for end in loop.ends]
+            for way, leads in zip(loop.ways, on, strict=True):
+                self.pulled[model.jnt_dofadr[way]] |= leads or not any(on)
         for k in np.flatnonzero(model.jnt_actfrclimited):
             dof = model.jnt_dofadr[k]
             given = self.torque[dof] if self.driven[dof] else [-np.inf, np.inf]
             self.torque[dof] = np.clip(given, *model.jnt_actfrcrange[k])
             self.driven[dof] = True
+
+    def _goes_on(self, model: mujoco.MjModel, end: int) -> bool:
+        """Whether a joint with a motor hangs on a body."""
+        bodies = model.jnt_bodyid[self.driven[model.jnt_dofadr]]
+        return any(end in _up(model, int(model.body_parentid[body])) for body in bodies)
 
     def _add(self, model: mujoco.MjModel, a: int) -> None:
         kind = model.actuator_trntype[a]
@@ -387,16 +521,18 @@ class _Writer:
             if kind == EQUALITY.mjEQ_JOINT:
                 if one in self.joints:
                     self._follow(name, one, other, model.eq_data[e, :5])
-            elif kind == EQUALITY.mjEQ_CONNECT or kind == EQUALITY.mjEQ_WELD:
-                sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
-                ends = [int(model.site_bodyid[x]) if sites else x for x in (one, other)]
-                tied = " to ".join(repr(model.body(x).name) for x in ends)
-                if set(ends) & set(self.bodies):
-                    self.notes.append(
-                        f"{name} ties {tied}: left out, the joints move as if it were cut"
-                    )
-            else:
+            elif kind not in TIES:
                 self.notes.append(f"{name} of tendons or flexes is left out")
+        for loop in _loops(model):
+            if set(loop.ends) & set(self.bodies):
+                tied = " to ".join(repr(model.body(x).name) for x in loop.ends)
+                cut = (
+                    f", the joints {self._joints(loop.joints)} of this closed chain move as if it "
+                    f"were cut; those of a leg without a motor need in [limits] the effort that "
+                    f"the chain gives them"
+                )
+                cut = cut if loop.joints else ""
+                self.notes.append(f"the equality {loop.name!r} ties {tied}: left out{cut}")
 
     def _follow(self, name: str, one: int, other: int, curve: np.ndarray) -> None:
         """The mimic of a joint that follows another, the one with a motor, along a line."""

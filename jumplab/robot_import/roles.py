@@ -16,6 +16,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.linalg import norm
 
+from jumplab.errors import RobotError
 from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import.checks import (
     MOST_RAD,
@@ -64,7 +65,20 @@ AXES = {
     for name, row in zip("xyz", s * np.eye(3), strict=True)
 }
 # axes of the root across the robot and up, in the order in which they are tried
-GUESSES = ("+y+z", "+x+z", "+z+y", "+z-y", "+x+y", "+x-y", "+y+x", "+y-x", "+z+x", "+z-x")
+GUESSES = (
+    "+y+z",
+    "+x+z",
+    "+z+y",
+    "+z-y",
+    "+x+y",
+    "+x-y",
+    "+y+x",
+    "+y-x",
+    "+z+x",
+    "+z-x",
+    "+y-z",
+    "+x-z",
+)
 
 Chain = list[Joint]
 
@@ -200,8 +214,9 @@ class _Finder:
         near = TOES * norm(ankle - knee)
 
         def of_ankle(joint: Joint) -> bool:
-            close = norm(self.at[joint] - ankle) < near
-            return close and self.turning(joint) < SWINGS
+            across = self.at[joint] - ankle  # an origin may lie anywhere on its axis
+            across = across - (across @ self.axis[joint]) * self.axis[joint]
+            return norm(across) < near and self.turning(joint) < SWINGS
 
         still = takewhile(of_ankle, chain[chain.index(three[2]) + 1 :])
         return [three[2], *still][-1].child
@@ -238,7 +253,11 @@ class _Finder:
         """The axis (3,) to the robot's left: knees bend backwards; those that say nothing leave it
         to the feet, to what hips and arms swing to, and to the root's frame.
         """
-        hips, knees, _ = zip(*(three for three, _ in self.legs), strict=True)
+        hips = [three[0] for three, _ in self.legs]
+        knees = []  # with a second one, as birds have, that bends the other way
+        for (hip, _, ankle), chain in self.legs:
+            pitch = self.pitch(chain)
+            knees += pitch[pitch.index(hip) + 1 : pitch.index(ankle)]
         left = self.lateral
         bent = self.middle(knees, left)
         if bent:
@@ -375,10 +394,10 @@ def _explain(tree: Tree) -> NoReturn:
                     )
                 elif joint.mimic:
                     kind = f"mimics {joint.mimic[0]!r}"
+                what = f"{'an' if role == 'ankle_pitch' else 'a'} {role.replace('_', ' ')}"
                 raise tree.error(
-                    f"joint {joint.name!r} {kind}, but has the place of a "
-                    f"{role.replace('_', ' ')}, which must be revolute with a range and a motor "
-                    f"of its own"
+                    f"joint {joint.name!r} {kind}, but has the place of {what}, which must be "
+                    f"revolute with a range and a motor of its own"
                 )
     for pair in zip(*(chain for _, chain in legs), strict=True) if legs else ():
         for still, moving in (pair, pair[::-1]):
@@ -395,7 +414,8 @@ def _explain(tree: Tree) -> NoReturn:
             f"one leg only: the chain that ends with joint {hanging.pop()!r} has no "
             f"mirror image among {len(tree.elements)} links; a jumper needs two legs"
         )
-    best = max(map(finder.pitch, finder.tips), key=len, default=[])
+    limbs = [chain for pair in finder.limbs() for chain in pair[::-1]]
+    best = max(map(finder.pitch, limbs or finder.tips), key=len, default=[])
     shown = ", ".join(repr(j.name) for j in best[:4]) or "none"
     raise tree.error(
         f"no pair of mirrored legs with three revolute pitch joints (hip, knee, "
@@ -422,17 +442,23 @@ class Draft:
 
 def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     """Find the roles in a URDF and write the first TOML file for it, from ``starter.toml.in``;
-    numbers that it lacks are asked for in comments. Raises :class:`RobotError`.
+    numbers that it lacks are asked for in comments. Raises :class:`RobotError`, with the notes of
+    the file.
 
     ``repair`` is what the person allows to be repaired.
     """
     path = Path(path)
     tree = read_tree(read_urdf(path), path.name, path, repair)
-    roles = find_roles(tree)
-    turn = robot_axes(tree.pose[roles.trunk].rotation, roles.forward, roles.up)
-    hip, _, ankle = (tree.pose[tree.joints[roles.joints[r][0]].child].translation for r in LEG)
-    leg_m = float(norm((turn @ (hip - ankle))[[0, 2]]))
-    sole = find_sole(tree, roles.feet[0], turn, leg_m)
+    try:
+        roles = find_roles(tree)
+        turn = robot_axes(tree.pose[roles.trunk].rotation, roles.forward, roles.up)
+        hip, _, ankle = (tree.pose[tree.joints[roles.joints[r][0]].child].translation for r in LEG)
+        leg_m = float(norm((turn @ (hip - ankle))[[0, 2]]))
+        sole = find_sole(tree, roles.feet[0], turn, leg_m)
+    except RobotError as e:
+        for note in notes(tree):
+            e.add_note(note)
+        raise
     assumed = "".join(
         f"\n[assumed.{key(joint)}]  # holds where [limits] has no number\n"
         + "".join(f"{part} = {x:g}\n" for part, x in limits.items())

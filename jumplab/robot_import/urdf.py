@@ -57,6 +57,7 @@ JOINTS = {
     "prismatic": pin.JointModelPrismaticUnaligned,
 }
 MOVING = tuple(JOINTS)
+LINK = "\n"  # before the names of links' frames: Pinocchio reduces no model where a joint has one
 FRAME_KG = 5e-4  # lighter links are frames, whose tensor nobody measured; it is ignored
 # relative, by which a moment may exceed the sum of the others: rounding must not refuse a robot
 TRIANGLE = 1e-3
@@ -65,6 +66,7 @@ LEFTOVER_M = 0.01
 MOST_MESH_M = 5.0  # no link is longer: a larger mesh is in millimetres
 # share of the largest second moment that a repaired inertia keeps: a plate, width over thickness 30
 THINNEST = 1e-3
+GEAR_SHARE = 0.25  # of what a joint carries: one that carries less, and leads it, is its motor's
 
 
 def locate(name: str, beside: Path) -> Path:
@@ -330,10 +332,33 @@ class Tree:
         self._build()
         for follower in [j for j in self.joints.values() if j.mimic]:
             leader = self.joints[follower.mimic[0]]
-            if leader not in self.chain(follower.child) and follower not in self.chain(
-                leader.child
-            ):
+            if leader in self.chain(follower.child):
+                continue
+            if self.carried(leader.child) < GEAR_SHARE * self.carried(follower.child):
+                self._gear(leader, follower)
+            elif follower not in self.chain(leader.child):
                 leader.driven = False  # a joint on another limb follows it
+
+    def _gear(self, motor: Joint, joint: Joint) -> None:
+        """Let a joint be moved by the motor that it follows, which carries next to nothing."""
+        _, factor, offset = joint.mimic
+        if not (motor.driven and factor and joint.kind in ("revolute", "continuous")):
+            return
+        limit = joint.element.find("limit")
+        for key, ratio in (("effort", 1 / factor), ("velocity", factor)):
+            joint.limits.pop(key, None)
+            if limit is not None:
+                limit.attrib.pop(key, None)
+            if key in motor.limits:
+                joint.limits[key] = abs(ratio) * motor.limits[key]
+        for key, ratio in zip(OWN, (factor**-2, 1 / abs(factor), factor**-2), strict=True):
+            if lost := joint.losses.get(key, 0.0) + ratio * motor.losses.get(key, 0.0):
+                joint.losses[key] = lost
+        joint.mimic, motor.mimic = None, (joint.name, 1 / factor, -offset / factor)
+        joint.driven, motor.driven = True, False
+        self.notes.append(
+            f"joint {joint.name!r} is moved by the motor of {motor.name!r}, by a gear of {factor:g}"
+        )
 
     def _build(self) -> None:
         """Pinocchio's model, outwards; inertias repaired as :func:`_inertia` says."""
@@ -350,7 +375,8 @@ class Tree:
             self.carrier[link] = carrier
             self.bodies.setdefault(carrier, []).append(link)
             self.model.appendBodyToJoint(carrier, _inertia(self.elements[link], self.mended), place)
-            self.model.addFrame(pin.Frame(link, carrier, 0, place, pin.FrameType.BODY))
+            frame = pin.Frame(LINK + link, carrier, 0, place, pin.FrameType.BODY)
+            self.model.addFrame(frame)
             below = [j for j in self.joints.values() if j.parent == link]
             todo += [(j.child, carrier, place * j.place, j.name, j.kind, j.axis) for j in below]
         data = self.model.createData()
@@ -457,7 +483,7 @@ class Tree:
 def links_of(model: pin.Model) -> dict[str, int]:
     """Index of the frame of every link, by name."""
     frames = enumerate(model.frames)
-    return {frame.name: i for i, frame in frames if frame.type == pin.FrameType.BODY}
+    return {frame.name[1:]: i for i, frame in frames if frame.type == pin.FrameType.BODY}
 
 
 def link_poses(model: pin.Model) -> dict[str, pin.SE3]:
