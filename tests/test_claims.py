@@ -304,6 +304,7 @@ def test_momentum_is_compared_in_the_first_tenth_of_a_second_and_after():
         (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t < 0.08), (8, 0)),  # four periods of 50 Hz
         (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t > 0.2) * (t < 0.3), (0, 10)),
         (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t > 0.46), (0, 0)),  # the plan is fast there itself
+        (lambda t: 0.035 * np.sin(2 * np.pi * 50 * t) * (t < 0.08), (8, 0)),  # swings by 1.75 % of the peak
         (lambda t: 0.015 * np.sin(2 * np.pi * 50 * t), (0, 0)),  # less than a hundredth of the peak
     ],
 )

@@ -31,7 +31,6 @@ from jumplab.sim import (
 from jumplab.sim import simulate_jump as simulate
 from jumplab.sim.result import events, record
 from jumplab.sim.scene import Contacts
-from jumplab.stages.planner import Planner
 from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_state
 from jumplab.task import JumpTask
 

@@ -89,16 +89,14 @@ def jump_tracking(plan: JumpPlan) -> dict[str, dict[str, dict[str, float]]]:
     rows, done = {"launch": slice(k), "flight": slice(k, None)}, {"rho_rate": _rho_rate(plan)}
     done |= {column: tape.extra[f"planar_{column}"] for column in TRACKED.values() if column not in done}
     return {
-        name: {
-            key: _missed(getattr(asked[name], column), done[column][part]) for key, column in TRACKED.items()
-        }
+        name: {key: _missed(getattr(asked[name], column), done[column][part]) for key, column in TRACKED.items()}
         for name, part in rows.items()
     }
 
 
 def launch_followed(plan: JumpPlan) -> dict[str, float]:
     """How far the launch is from stage 1's: rms of ``L`` and ``velocity`` as shares of their peaks, and of ``rho`` as a
-    share of its mean (Sec. V-A); ``com``, the largest distance of the CoM from its path, both from where they start [m].
+    share of its mean (Sec. V-A); ``com``, the largest distance of the CoM from its path, both from their starts [m].
     """
     missed, peaks = jump_tracking(plan)["launch"], plan.srmp.launch
     asked, k = _asked(plan)[0], plan.tape.takeoff_index
