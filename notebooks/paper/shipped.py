@@ -1,8 +1,7 @@
 """Robots that a name loads: one jump of each, played in every engine and mode, and the map of what it can do.
 
-``python -m paper.shipped [NAME ...]`` in the folder of the notebooks measures what ``shipped.jsonl`` lacks of the robots
-as they are now; those whose package is not there keep their rows, below the stamp of the code that made them. Notebook 07
-draws the file.
+``python -m paper.shipped [NAME ...]`` in the folder of the notebooks measures what ``shipped.jsonl`` lacks of the
+robots as they are now; those whose package is not there keep their rows. Notebook 07 draws the file.
 """
 
 from __future__ import annotations
