@@ -198,6 +198,8 @@ def test_the_book_has_all_that_it_names():
     """Every module of the reference can be imported; every page is in the index."""
     modules = re.findall(r"automodule:: ([\w.]+)", PAGES["api"])
     assert len(modules) > 30 and all(importlib.import_module(name).__doc__ for name in modules)
+    names = {name: getattr(jl, name) for name in jl.__all__}
+    assert {getattr(x, "__module__", modules[0]) for x in names.values()} <= set(modules)
     listed = re.findall(r"^([a-z]+)$", PAGES["index"], re.M)
     assert sorted([*listed, "index"]) == sorted(PAGES)
     assert (ROOT / "figures" / "jump.gif").stat().st_size <= 1.5e6
