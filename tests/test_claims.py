@@ -499,5 +499,5 @@ def test_the_same_words_everywhere():
 
 def test_the_book_has_the_stored_counts():
     page = (Path(__file__).parent.parent / "notebooks" / "book" / "validity.md").read_text(encoding="utf-8")
-    rows = worlds.counts()
-    assert len(rows) == 9 and all(f"\n{row}\n" in page for row in rows), "python -m paper.worlds --counts"
+    rows = [*worlds.counts(), *worlds.contact_counts()]
+    assert len(rows) == 12 and all(f"\n{row}\n" in page for row in rows), "python -m paper.worlds --counts"

@@ -297,6 +297,31 @@ def counts() -> list[str]:
     return lines
 
 
+def contact_counts() -> list[str]:
+    """Rows of the page on validity: the drawn plans on MuJoCo's default contacts, and the largest misses of those that
+    stand.
+
+    ``python -m paper.worlds --counts`` prints them, too.
+    """
+    kept = [r for r in logs.rows(DRAWN) if r["world"] == "MuJoCo, usual" and "stands" in r]
+    lines = []
+    for jumps, aside, robots in (
+        ("straight ahead, all robots", False, tuple(HUMANOIDS)),
+        ("to the side and with turns, `bhr`", True, ("bhr",)),
+        ("to the side and with turns, `g1_arms`", True, ("g1_arms",)),
+    ):
+        cells = []
+        for way in WAYS:
+            names = [(r, *r["case"].split()) for r in kept if r["way"] == way]
+            here = [r for r, robot, _, kind in names if robot in robots and (kind in ("side", "turn")) == aside]
+            stand = [r for r in here if r["stands"]]
+            miss_m, apex_m, tilt_deg = (max(abs(r[key]) for r in stand) for key in ("miss_m", "apex_m", "tilt_deg"))
+            off = f"{100 * miss_m:.0f} cm, {100 * apex_m:.0f} cm, {tilt_deg:.0f}°"
+            cells += [f"{len(stand)} of {len(here)}", off]
+        lines.append(f"| {jumps} | {' | '.join(cells)} |")
+    return lines
+
+
 def share(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """How many of the re-aimed robots of ``rows`` land, with Wilson's 95 % interval, and what the falls begin with."""
     landed = sum(r["landed"] for r in rows)
@@ -308,7 +333,7 @@ def share(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 if __name__ == "__main__":
     if sys.argv[1] == "--counts":
-        sys.exit(print(*counts(), sep="\n"))
+        sys.exit(print(*counts(), *contact_counts(), sep="\n"))
     made = {"--flips": flips, "--contacts": contacts}.get(sys.argv[1], study)
     rest = sys.argv[1 + (made is not study) :]
     made(rest[0], jobs=int(rest[1]) if len(rest) > 1 else None)
