@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump, planner
-from paper import claims, hard_cases, worlds
+from paper import capture, claims, hard_cases, worlds
 from paper.claims import CLAIMS, Start, against_crouch, compare_starts, judge, readings, readings_markdown
 from paper.tracking import followed_table, launch_followed, tracking
 
@@ -501,3 +501,4 @@ def test_the_book_has_the_stored_counts():
     page = (Path(__file__).parent.parent / "notebooks" / "book" / "validity.md").read_text(encoding="utf-8")
     rows = [*worlds.counts(), *worlds.contact_counts()]
     assert len(rows) == 12 and all(f"\n{row}\n" in page for row in rows), "python -m paper.worlds --counts"
+    assert capture.line() in " ".join(page.split()), "python -m paper.capture"
