@@ -1,7 +1,7 @@
 """Mutants of modules whose word is trusted: one operator, number, name or sentence changed at a time, in memory.
 
-``python tests/mutants.py audit exports checks`` runs the tests concerned on every mutant, each in a fork of one warm
-process, and prints the share that one of them notices; ``--share 0.1 --seed 1`` takes a sample. No part of the
+``python tests/mutants.py audit exports checks claims`` runs the tests concerned on every mutant, each in a fork of one
+warm process, and prints the share that one of them notices; ``--share 0.1 --seed 1`` takes a sample. No part of the
 collected tests.
 """
 
@@ -19,6 +19,8 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 
 import pytest
@@ -33,7 +35,46 @@ JUDGED = {
         0.95,
     ),
     "checks": (("jumplab.sim.checks",), ("tests/test_sim_amounts.py",), 0.90),
+    "claims": (("paper.claims", "paper.tracking"), ("tests/test_claims.py", "-m", "not slow"), 1.0),
 }
+# where a part has a list, its mutants are these alone: module, what is changed, and into what
+CHOSEN = {
+    "claims": (
+        ("paper.claims", "if claim.adopted else CHANGED if change else HOLDS", "if claim.adopted else HOLDS"),
+        ("paper.claims", "agreed if ok else FAILS", "agreed"),
+        ("paper.claims", "ok = all(least <= values[key] <= most", "ok = any(least <= values[key] <= most"),
+        ("paper.claims", "ok = all(least <= values[key] <= most", "ok = all(values[key] <= most"),
+        ("paper.claims", '"L off, rms, share of its peak": (0, 0.1)', '"L off, rms, share of its peak": (0, 0.2)'),
+        ("paper.claims", '"share that hits the goal": (0.9, 1)', '"share that hits the goal": (0.8, 1)'),
+        ("paper.claims", "first, later = (float(np.sqrt(np.mean(e**2)))", "first, later = (float(np.mean(abs(e)) / 2)"),
+        ("paper.claims", "float(np.sqrt(np.mean(e**2)))", "float(np.sqrt(np.mean(e**2)) / 2)"),
+        ("paper.claims", "return first, later", "return later, first"),
+        ("paper.claims", "return error[start], error[~start]", "return error[~start], error[start]"),
+        ("paper.claims", "start = run.t[down] < FIRST_S", "start = run.t[down] < 2 * FIRST_S"),
+        ("paper.claims", "down = run.t < run.metrics.liftoff_s", "down = run.t < run.t[-1]"),
+        ("paper.claims", "return float(np.degrees(pitch[push] - pitch[0]))", "return float(pitch[push] - pitch[0])"),
+        ("paper.claims", "push = int(np.argmin(rate[: np.argmax(rate)]))", "push = int(np.argmin(rate))"),
+        ("paper.claims", "SWING = 0.01", "SWING = 0.02"),
+        ("paper.claims", "[: -round(LAST_S / STEP_S)]", "[:]"),
+        ("paper.claims", "FIRST_S, LAST_S, STEADY_S = 0.1, 0.05, 0.02", "FIRST_S, LAST_S, STEADY_S = 0.1, 0.05, 0.04"),
+        ("paper.claims", "np.diff(velocity, axis=0) / STEP_S - gravity", "np.diff(velocity, axis=0) / STEP_S"),
+        ("paper.claims", "q[7:][moved] = folded[7:][moved]", "q[7:][moved] = folded[7:][moved] / 2"),
+        ("paper.claims", "r.total_s / c.total_s for r, c in both", "r.alone_s / c.alone_s for r, c in both"),
+        ("paper.claims", "SAME_COST = 1.01", "SAME_COST = 1.02"),
+        ("paper.claims", 'np.degrees([*sagittal', "np.array([*sagittal"),
+        ("paper.tracking", 'missed["L"]["rms"] / float', 'missed["L"]["rms"] / 2 / float'),
+        ("paper.tracking", "np.abs(peaks.L).max()", "np.abs(peaks.L).mean()"),
+        ("paper.tracking", "np.mean(np.sum((done - asked) ** 2, axis=0))", "np.mean((done - asked) ** 2)"),
+        ("paper.tracking", "np.subtract(*ways), axis=1).max()", "np.subtract(*ways), axis=1).mean()"),
+        ("paper.tracking", "return asked.launch, asked.flight", "return asked.flight, asked.launch"),
+        ("paper.tracking", '"yes" if max(sizes) <= most', '"yes" if np.median(sizes) <= most'),
+        ("paper.tracking", '"CoM off its path", 3.0, 100', '"CoM off its path", 9.0, 100'),
+        ("paper.tracking", 'momentum = np.abs(missed["L"][:n]) / max', 'momentum = np.abs(missed["L"][:n]) / 2 / max'),
+        ("paper.tracking", "np.mean(x**2)) / size)", "np.mean(x**2)) / size / 2)"),
+        ("paper.tracking", '"touchdown_foot": float(foot[-1])', '"touchdown_foot": float(foot[0])'),
+        ("paper.tracking", 'norm(missed["com"][:n], axis=1)', 'norm(missed["com"], axis=1)'),
+    )
+}  # fmt: skip
 # mutants that do the same: what is changed, where in its line, the line; and why
 SAME = {
     ("Sub", 44, "return max(foot.heel - x, x - foot.toe, abs(y - foot.center[1]) - foot.half_width)"): "center[1] is 0",
@@ -71,6 +112,19 @@ def changes(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], None]]]:
             yield name, functools.partial(lambda f, new, n: setattr(n, f, new), field, NAMES[name])
     if isinstance(node, ast.keyword) and node.arg not in GUARDS:
         yield f"{node.arg}=", lambda n: setattr(n, "value", ast.Constant(None))
+
+
+def chosen(part: str) -> Iterator[Mutant]:
+    """The mutants that :data:`CHOSEN` has for a part: one passage of a module each, which stands there once."""
+    for name, old, new in CHOSEN[part]:
+        module = importlib.import_module(name)
+        text = inspect.getsource(module)
+        if text.count(old) != 1:
+            raise ValueError(f"{name}: {old!r} stands there {text.count(old)} times; renew the list of mutants")
+        row = text[: text.index(old)].count("\n") + 1
+        tops = [n for n in ast.parse(text).body if isinstance(n, ast.FunctionDef) and n.lineno <= row <= n.end_lineno]
+        first = min([n.lineno, *(d.lineno for d in n.decorator_list)]) if (n := next(iter(tops), None)) else 0
+        yield Mutant(module, f"{name}:{row} {new}", first, functools.partial(ast.parse, text.replace(old, new)))
 
 
 @dataclass(frozen=True)
@@ -118,7 +172,7 @@ def install(module: ModuleType, tree: ast.Module) -> None:
     """Let everyone who imported from a module see the mutant: functions get its code, the rest its objects."""
     usual, mutant = dict(vars(module)), {"__name__": module.__name__, "__file__": module.__file__}
     exec(compile(tree, module.__file__, "exec"), mutant)
-    others = [m for name, m in sys.modules.items() if name.startswith(("jumplab", "test_", "fixtures"))]
+    others = [m for name, m in sys.modules.items() if name.startswith(("jumplab", "paper", "test_", "fixtures"))]
     for name, new in mutant.items():
         old = usual.get(name)
         ours = getattr(old, "__module__", module.__name__) == module.__name__
@@ -216,9 +270,11 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="mutants whose line or place contains this text")
     asked, short = parser.parse_args(), False
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "notebooks"))  # of the package "paper"
     for part in asked.parts:
         modules, tests, least = JUDGED[part]
-        found = [x for m in map(importlib.import_module, modules) for x in mutants(m) if asked.only in x.name]
+        every = chosen(part) if part in CHOSEN else chain(*map(mutants, map(importlib.import_module, modules)))
+        found = [x for x in every if asked.only in x.name]
         judge = Judge(random.Random(asked.seed).sample(found, round(asked.share * len(found))))
         if pytest.main(["-q", "-s", "-p", "no:cacheprovider", "--tb=short", *tests], plugins=[judge]):
             return 2

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump, planner
-from paper import claims, hard_cases
+from paper import capture, claims, hard_cases, worlds
 from paper.claims import CLAIMS, Start, against_crouch, compare_starts, judge, readings, readings_markdown
-from paper.tracking import launch_followed, tracking
+from paper.tracking import followed_table, launch_followed, tracking
 
 from jumplab.cli import notebooks
 from jumplab.errors import InputError
@@ -304,6 +304,7 @@ def test_momentum_is_compared_in_the_first_tenth_of_a_second_and_after():
         (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t < 0.08), (8, 0)),  # four periods of 50 Hz
         (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t > 0.2) * (t < 0.3), (0, 10)),
         (lambda t: 0.1 * np.sin(2 * np.pi * 50 * t) * (t > 0.46), (0, 0)),  # the plan is fast there itself
+        (lambda t: 0.035 * np.sin(2 * np.pi * 50 * t) * (t < 0.08), (8, 0)),  # swings by 1.75 % of the peak
         (lambda t: 0.015 * np.sin(2 * np.pi * 50 * t), (0, 0)),  # less than a hundredth of the peak
     ],
 )
@@ -355,24 +356,53 @@ def test_tracking_by_hand(monkeypatch, bhr):
     )
 
 
-def test_how_a_launch_is_followed_by_hand(monkeypatch):
-    """Shares of the peaks of L and of the CoM's speed, and of the mean of the inertia."""
+def a_launch(monkeypatch, com_x=(0.0, 0.0, 0.0, 0.0), L=-1.5):
+    """A jump of four instants of launch and two of flight: L asked -2 in launch, 7 in flight, peaks 5 in both."""
     n, k = 6, 4
     two = np.ones((n, 2))
 
     def asked(launch_t, flight_t):
-        parts = (SimpleNamespace(L=np.full(len(t), -2.0), com_velocity=two[: len(t)] * [0.0, 2.0], rho_rate=0.0 * t,
-                                 rho=np.full(len(t), 4.0)) for t in (launch_t, flight_t))  # fmt: skip
+        parts = (SimpleNamespace(L=np.full(len(t), L), com_velocity=two[: len(t)] * [0.0, 2.0], rho_rate=0.0 * t,
+                                 rho=np.full(len(t), 4.0), com=two[: len(t)] * [0.3, 0.6])
+                 for t, L in ((launch_t, -2.0), (flight_t, 7.0)))  # fmt: skip
         return SimpleNamespace(**dict(zip(("launch", "flight"), parts, strict=True)))
 
-    column = {"L": np.full(n, -1.5), "rho": np.full(n, 4.2), "com_velocity": two * [0.03, 2.04], "toe_phase_start": 0.2}
+    column = {"L": np.full(n, L), "rho": np.full(n, 4.2), "com_velocity": two * [0.03, 2.04], "toe_phase_start": 0.2,
+              "com": np.transpose([[*com_x, 9.0, 9.0], [0.5, 0.5, 0.5, 0.5, 9.0, 9.0]])}  # fmt: skip
     tape = SimpleNamespace(t=np.array([0, 0.1, 0.2, 0.3, 0.3, 0.6]), takeoff_index=k, takeoff_time=0.3,
                            extra={f"planar_{name}": x for name, x in column.items()})  # fmt: skip
     peaks = SimpleNamespace(L=np.array([0.0, -5.0, 1.0]), com_velocity=np.array([[0.0, 0.0], [3.0, 4.0]]))
     srmp = SimpleNamespace(launch_s=0.8, toe_s=0.1, flight_s=0.6, at=asked, launch=peaks)
     monkeypatch.setattr("paper.tracking._rho_rate", lambda plan: np.zeros(n))
-    found = launch_followed(SimpleNamespace(tape=tape, srmp=srmp))
-    assert found == pytest.approx({"L": 0.1, "velocity": 0.05 / 5.0, "rho": 0.05})
+    return SimpleNamespace(tape=tape, srmp=srmp)
+
+
+def test_how_a_launch_is_followed_by_hand(monkeypatch):
+    """Shares of the peaks of L and of the CoM's speed, and of the mean of the inertia; paths from where they start."""
+    found = launch_followed(a_launch(monkeypatch, (0.1, 0.1, 0.13, 0.1)))
+    assert found == pytest.approx({"L": 0.1, "velocity": 0.05 / 5.0, "rho": 0.05, "com": 0.03})
+
+
+def test_a_launch_is_judged_by_its_worst_jump(monkeypatch):
+    jumps = [a_launch(monkeypatch, (0.0, 0.0, way, 0.0), L) for way, L in ((0.0, -2.0), (0.02, -1.9), (0.04, -1.5))]
+    rows = {row["unit"]: row for row in followed_table(jumps) if row["in the launch"] != "CoM velocity, rms"}
+    spun, still, way = (rows[unit] for unit in ("% of its peak", "% of its mean", "cm"))
+    assert (spun["median"], spun["worst"], spun["holds"]) == (pytest.approx(2.0), pytest.approx(10.0), "yes")
+    assert (way["median"], way["worst"], way["holds"]) == (pytest.approx(2.0), pytest.approx(4.0), "does not hold")
+    assert (spun["at most"], way["at most"], still["at most"], still["holds"]) == (10.0, 3.0, "", "")
+    assert followed_table([a_launch(monkeypatch, L=-1.49)])[0]["holds"] == "does not hold"
+
+
+def test_postures_at_touchdown_are_in_degrees(bhr, monkeypatch):
+    """Of stage 2, stage 3 and the stance: four joints by the difference of their links, trunk and foot."""
+    links = np.radians([5.0, 15.0, -30.0, 10.0, 40.0])  # foot, shank, thigh, trunk, arm
+    monkeypatch.setattr("paper.claims.to_link_angles", lambda *_: ([None, links],))
+    joints = SimpleNamespace(q=None, v=None, a=None)
+    tape = SimpleNamespace(extra={"planar_angles": [None, 2 * links]})
+    rows = claims.touchdown_postures(SimpleNamespace(robot=bhr, joints=joints, tape=tape))
+    found = {row["what"]: row for row in rows}
+    assert found["trunk"]["stage 2"] == pytest.approx(10.0) and found["foot"]["stage 3"] == pytest.approx(10.0)
+    assert abs(found["knee"]["stage 2"]) == pytest.approx(45.0) and abs(found["hip"]["stage 3"]) == pytest.approx(80.0)
 
 
 # ------------------------------------------------------------------------------------------ three steps against one
@@ -441,11 +471,20 @@ def test_the_jump_follows_stage_one():
     assert launch_followed(loose)["L"] > 4 * followed["L"]
 
 
+@pytest.mark.slow
+def test_what_following_costs_and_where_it_ends():
+    """The CoM leaves its path by more than the 3 cm asked, and the effort is more than the direct program's."""
+    for target in ((0.0, 0.5), (1.0, 0.5)):
+        assert 0.03 < launch_followed(jump(*target))["com"] < 0.09
+        both = [hard_cases.effort(jump(*target, method=method).whole_body) for method in METHODS]
+        assert 1.6 < both[0] / both[1] < 2.2, both
+
+
 def test_the_same_words_everywhere():
     """The book and two notebooks say alike what three steps buy; the book's counts are the stored ones."""
     root = Path(__file__).resolve().parent.parent
     page = " ".join((root / "notebooks" / "book" / "validity.md").read_text(encoding="utf-8").split())
-    said = re.search(r"Three steps give insight instead\. .*? 2 % in inertia\.", page)[0]
+    said = re.search(r"Three steps give insight instead\. .*? 2\.4 % in inertia\.", page)[0]
     for stem in ("00_overview", "10_benchmark"):
         cells = json.loads((root / "notebooks" / f"{stem}.ipynb").read_text(encoding="utf-8"))["cells"]
         text = " ".join("".join(s for c in cells if c["cell_type"] == "markdown" for s in [*c["source"], "\n"]).split())
@@ -455,4 +494,11 @@ def test_the_same_words_everywhere():
         f"Three steps ended in a plan that passes the whole audit in {every['three-step, clean']} of "
         f"{every['number']} harder cases, the direct program in {every['direct, clean']}"
     )
-    assert counted in page and "made with the five-link program" in page
+    assert counted in page
+
+
+def test_the_book_has_the_stored_counts():
+    page = (Path(__file__).parent.parent / "notebooks" / "book" / "validity.md").read_text(encoding="utf-8")
+    rows = [*worlds.counts(), *worlds.contact_counts()]
+    assert len(rows) == 12 and all(f"\n{row}\n" in page for row in rows), "python -m paper.worlds --counts"
+    assert capture.line() in " ".join(page.split()), "python -m paper.capture"

@@ -412,6 +412,9 @@ def test_readme_tells_what_the_run_measured(chain):
         [summary["planned_distance_m"], simulation["foot_distance_m"]], abs=0.001
     )
     assert said["rise of the CoM"] == pytest.approx([summary["planned_rise_m"], simulation["com_rise_m"]], abs=0.001)
+    apex = re.search(r"^\| apex of the CoM above its stance \| \| ([\d.]+) m \| ([\d.]+) m \|$", readme, re.M).groups()
+    there = [summary["planned_apex_m"], simulation["com_apex_m"]]
+    assert [float(x) for x in apex] == pytest.approx(there, abs=0.001)
     assert said["on its feet after touchdown"] == pytest.approx([simulation["standing_s"]], abs=0.01)
     passport = store.read_json(chain.out / "passport.json")
     assert len(passport["checks"]) == 51 and "passes 51 independent checks" in readme

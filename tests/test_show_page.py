@@ -116,6 +116,12 @@ def test_poses_are_those_of_the_log(page, simulation, bhr):
     assert starts["landing"] == pytest.approx(simulation.metrics.touchdown_s, abs=0.021)
 
 
+def test_weight_is_that_under_the_gravity_of_the_jump(bhr):
+    moon, tape = bhr.under_gravity(1.62), jump(0.5, 0.3).tape
+    weights = [facts_of(viewer.page(robot, plan=tape))["weight"] for robot in (bhr, moon)]
+    assert weights == pytest.approx([42.0 * 9.8, 42.0 * 1.62])
+
+
 def packed(clip, name, *shape):
     return np.frombuffer(base64.b64decode(clip[name]), "<f4").reshape(clip["frames"], *shape).astype(float)
 

@@ -170,8 +170,8 @@ class QpSolver:
 
     Parameters
     ----------
-    tolerance : of residuals, absolute; where the cost is nearly flat, 1e-9 leaves accelerations of
-        stage 2 apart by 2e-4 m/s^2 or rad/s^2, 1e-11 by 6e-7, in as much time.
+    tolerance : of residuals, absolute; where the cost is nearly flat, 1e-9 leaves more digits of
+        the accelerations open than 1e-11, which takes hardly longer.
     iterations : at most.
     infeasible : how clearly a program must have no answer before the search for one ends.
 

@@ -28,7 +28,7 @@ from jumplab.show.bodies import ABOVE_M
 from jumplab.show.shapes import PAINTS, Part, Trace, ground_forces, parts_of, trace
 from jumplab.show.style import PHASE_COLORS, describe_task
 from jumplab.sim.scene import Scene
-from jumplab.task import GRAVITY, JumpTask
+from jumplab.task import JumpTask
 
 FPS = 50.0  # frames a second: every twentieth sample of a log; the page turns smoothly between them
 AHEAD_M = 0.75  # ground that is seen behind the start and beyond the end of the jump
@@ -103,7 +103,7 @@ def page(
         "title": title or (describe_task(task) if task else "A jump"),
         "note": " · ".join([size, f"{FPS:g} frames per second", *notes]),
         "fps": FPS,
-        "weight": robot.total_mass * GRAVITY,
+        "weight": robot.total_mass * robot.gravity,
         "parts": list(map(_part, parts)),
         "joints": list(robot.joint_names),
         "clips": [
@@ -215,7 +215,7 @@ def _values(
             height,
             np.degrees(motion.q[:, 7 + pairs[:, 0]]),
             shares[:, pairs].max(axis=2),
-            push / (robot.total_mass * GRAVITY),
+            push / (robot.total_mass * robot.gravity),
             joints,
         ]
     )

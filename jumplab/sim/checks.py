@@ -216,7 +216,7 @@ def _steps(result: SimulationResult) -> tuple[np.ndarray, np.ndarray, np.ndarray
     One semi-implicit step does so at its beginning, many do on the whole in the middle.
     Accelerations are those of the base in world axes, of its CoM or of its origin, as the engine
     integrates: differences of the twist in the base's own axes, which turn within the step, would
-    be off by 17 N in a flip, those of the other point by 1 to 4 N in a fall.
+    be wrong in a flip, those of the other point in a fall.
     """
     engine = result.settings["engine"]
     share = 0.0 if engine["substeps"] == 1 else 0.5

@@ -22,7 +22,6 @@ from matplotlib.figure import Figure
 
 from jumplab.auditing import audit
 from jumplab.errors import SolverError
-from jumplab.io.files import write_file
 from jumplab.robot import Robot
 from jumplab.show.style import COLUMN_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
 from jumplab.stages.planner import Planner
@@ -31,6 +30,7 @@ from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.coordinates import even
 from jumplab.studies.atlas import Atlas
 from jumplab.task import JumpTask
+from paper import logs
 
 NODES = (20, 40, 80)  # intervals of the three phases together
 NODE_REPEATS = 3  # the growth is a fit over many meshes
@@ -205,4 +205,4 @@ def sweeps_picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 if __name__ == "__main__":
-    write_file(SWEEPS, (json.dumps({"cpus": os.cpu_count(), "rows": sweeps()}, indent=1) + "\n").encode())
+    logs.write_table(SWEEPS, {"cpus": os.cpu_count(), "rows": sweeps()})

@@ -130,6 +130,12 @@ def _solved(planner: Planner, method: str, case: Case) -> tuple[WholeBodyPlan, A
     return body, make_tape(body, srmp)
 
 
+def effort(plan: WholeBodyPlan) -> float:
+    """What a plan costs besides following stage 1 [1], all methods weighed alike."""
+    costs = [r for r in plan.solution.cost_shares if r["name"] in EFFORT]
+    return sum(r["cost"] * EFFORT[r["name"]] / r["weight"] for r in costs)
+
+
 def solve(case: Case, method: str) -> dict[str, Any]:
     """One solve as a row of plain types: what was asked, whether it is planned and clean, time [s], effort, reason."""
     planner = _planner(case.kind, case.variant if case.kind in KINDS[3:5] else -1)
@@ -143,8 +149,7 @@ def solve(case: Case, method: str) -> dict[str, Any]:
     except JumplabError as e:
         return row | {"cpu_s": time.process_time() - began, "effort": None, "reason": str(e)[:160]}
     row |= {"planned": True, "cpu_s": time.process_time() - began, "reason": ""}
-    costs = [r for r in body.solution.cost_shares if r["name"] in EFFORT]
-    row["effort"] = sum(r["cost"] * EFFORT[r["name"]] / r["weight"] for r in costs)  # both methods weighed alike
+    row["effort"] = effort(body)
     found = audit(tape, planner.robot, t, edge_m=body.edge_m)
     return row | {"clean": found.passed}
 

@@ -155,7 +155,8 @@ def table(path: Path, say: Callable[[str], Any] = print) -> Any:
     found = json.loads(path.read_text(encoding="utf-8"))
     made = found.get(STAMP) if isinstance(found, dict) else None
     inner = found if made is None else found["table"]
-    say(f"{path.name}: {age([made] * len(inner))}")
+    counted = inner["rows"] if isinstance(inner, dict) and "rows" in inner else inner
+    say(f"{path.name}: {age([made] * len(counted))}")
     return inner
 
 

@@ -107,6 +107,13 @@ def stored(engine: str, feature: str, path: Path = LOG) -> list[SimpleNamespace]
     return sorted(here, key=lambda r: r.number)
 
 
+def origin(path: Path = LOG) -> tuple[str, str]:
+    """Mode in which the kept robots jumped, and their plan in words; what has no stamp is of the former version."""
+    if logs.lines(path)[0][1]:
+        return TrialSettings().mode, "plan of the direct program"
+    return "whole-body", "plan of the five-link program of the former version"
+
+
 def shares(trials: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     """Number of trials that land, by name, with Wilson's 95 % interval [%]."""
     rows = []

@@ -1,13 +1,15 @@
 """Robots that a name loads: one jump of each, played in every engine and mode, and the map of what it can do.
 
-``python -m paper.shipped [NAME ...]`` in the folder of the notebooks measures what ``shipped.json`` lacks of the robots
-as they are now; those whose package is not there keep their rows. Notebook 07 draws the file.
+``python -m paper.shipped [NAME ...]`` in the folder of the notebooks measures what ``shipped.jsonl`` lacks of the
+robots as they are now; those whose package is not there keep their rows. Notebook 07 draws the file.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +24,15 @@ from jumplab.task import JumpTask
 from paper import logs
 from paper.humanoids import SHARES, leg_m
 
-TABLE = Path(__file__).with_name("shipped.json")
+LOG = Path(__file__).with_name("shipped.jsonl")
 FAR, HIGH = (0.0, 0.25, 0.5, 0.75, 1.0), (0.1, 0.2, 0.3, 0.4, 0.5)  # of the map, in lengths of the leg
 LESS = (1.0, 0.75, 0.5, 0.25)  # of SHARES, the first that is clean and stands in every engine
 
 
 def rows() -> dict[str, dict[str, Any]]:
-    """By robot: its hash, planner, mass, the jump with its playbacks, and the cells of the map."""
-    return logs.table(TABLE) if TABLE.exists() else {}
+    """By robot: its hash, planner, mass, the jump with its playbacks, and the cells of the map; the last row counts."""
+    found = {row["robot"]: row for row in logs.rows(LOG)}
+    return {name: found[name] for name in SHIPPED if name in found}
 
 
 def measured(robot: Robot) -> dict[str, Any]:
@@ -71,18 +74,17 @@ def jumped(robot: Robot, size: float) -> dict[str, Any]:
     return row
 
 
-def mapped(name: str) -> Envelope:
-    """The stored map of a robot, as :func:`jumplab.envelope` gives it."""
-    row = rows()[name]
+def mapped(row: Mapping[str, Any]) -> Envelope:
+    """The map in a row, as :func:`jumplab.envelope` gives it."""
     cells = (Cell(*cell[:4], float("nan") if cell[4] is None else cell[4]) for cell in row["cells"])
-    return Envelope(name, tuple(row["distances_m"]), tuple(row["heights_m"]), tuple(cells))
+    return Envelope(row["robot"], tuple(row["distances_m"]), tuple(row["heights_m"]), tuple(cells))
 
 
 def verdicts() -> list[dict[str, Any]]:
     """A line per robot: its jump, how many of the playbacks stand, and the ends of its map with what limits them."""
-    lines, table = [], rows()
-    for name in (name for name in SHIPPED if name in table):
-        row, found = table[name], mapped(name)
+    lines = []
+    for name, row in rows().items():
+        found = mapped(row)
         jump = row["jump"]
         line: dict[str, Any] = {"robot": name, "kg": row["kg"], "program": row["planner"]}
         line["jump"] = f"{jump['distance_m']:.2f} m, {jump['rise_m']:.2f} m" if jump else "none found"
@@ -94,18 +96,18 @@ def verdicts() -> list[dict[str, Any]]:
 
 
 def main(*names: str) -> None:
-    """Measure what the table lacks."""
-    table = rows()
-    for name in names or SHIPPED:
-        try:
-            robot = Robot.load(name)
-        except RobotError as e:
-            print(name, e, flush=True)
-            continue
-        if table.get(name, {}).get("hash") != robot.hash:
-            table = {n: row for n in SHIPPED if (row := measured(robot) if n == name else table.get(n))}
-            logs.write_table(TABLE, table)
-        print(name, table[name]["jump"], flush=True)
+    """Measure what the log lacks."""
+    with logs.keep(LOG, itemgetter("robot", "hash")) as log:
+        for name in names or SHIPPED:
+            try:
+                robot = Robot.load(name)
+            except RobotError as e:
+                print(name, e, flush=True)
+                continue
+            key = name, robot.hash
+            if key not in log.done:
+                log.add({"robot": name} | measured(robot))
+            print(name, log.done[key]["jump"], flush=True)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 
 from jumplab.models.full import FullBody, pitch_inertia
@@ -12,6 +15,13 @@ from jumplab.stages.srmp import SrmpPlan
 
 # of the jump: quantity -> column of stage 1
 TRACKED = {"rho": "rho", "rho_rate": "rho_rate", "velocity": "com_velocity", "L": "L"}
+# of the launch: what, the most that "follows" allows (None: not asked), and the unit with its factor
+ASKED = {
+    "L": ("angular momentum, rms", 10.0, 100, "% of its peak"),
+    "velocity": ("CoM velocity, rms", 5.0, 100, "% of its peak"),
+    "rho": ("inertia, rms", None, 100, "% of its mean"),
+    "com": ("CoM off its path", 3.0, 100, "cm"),
+}
 
 
 def compared(plan: JointPlan, srmp: SrmpPlan, robot: Robot) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -74,32 +84,51 @@ def jump_tracking(plan: JumpPlan) -> dict[str, dict[str, dict[str, float]]]:
     phase ("launch", "flight") -> "rho" [kg m^2], "rho_rate" [kg m^2/s], "velocity" of the CoM [m/s], "L" [kg m^2/s] ->
     "rms" of the difference, and "relative_rms", its share of the reference's mean size.
     """
-    tape, srmp, k = plan.tape, plan.srmp, plan.tape.takeoff_index
-    toe = float(tape.extra["planar_toe_phase_start"])
-    ends = [0.0, srmp.launch_s - srmp.toe_s, srmp.launch_s]
-    air = tape.t[k:] - tape.takeoff_time
-    launch_t = np.interp(tape.t[:k], [0.0, toe, tape.takeoff_time], ends)  # when each instant is in stage 1
-    asked = srmp.at(launch_t, air * srmp.flight_s / air[-1])
+    tape, k = plan.tape, plan.tape.takeoff_index
+    asked = dict(zip(("launch", "flight"), _asked(plan), strict=True))
     rows, done = {"launch": slice(k), "flight": slice(k, None)}, {"rho_rate": _rho_rate(plan)}
     done |= {column: tape.extra[f"planar_{column}"] for column in TRACKED.values() if column not in done}
     return {
-        name: {
-            key: _missed(getattr(getattr(asked, name), column), done[column][part]) for key, column in TRACKED.items()
-        }
+        name: {key: _missed(getattr(asked[name], column), done[column][part]) for key, column in TRACKED.items()}
         for name, part in rows.items()
     }
 
 
 def launch_followed(plan: JumpPlan) -> dict[str, float]:
     """Differences of the launch from stage 1's: rms of ``L`` and ``velocity`` as shares of their peaks, and of ``rho``
-    as a share of its mean (Sec. V-A).
+    as a share of its mean (Sec. V-A); ``com``, the largest distance of the CoM from its path, both from their starts [m].
     """
-    missed, asked = jump_tracking(plan)["launch"], plan.srmp.launch
+    missed, peaks = jump_tracking(plan)["launch"], plan.srmp.launch
+    asked, k = _asked(plan)[0], plan.tape.takeoff_index
+    ways = (com[:k] - com[0] for com in (plan.tape.extra["planar_com"], asked.com))
     return {
-        "L": missed["L"]["rms"] / float(np.abs(asked.L).max()),
-        "velocity": missed["velocity"]["rms"] / float(np.linalg.norm(asked.com_velocity, axis=1).max()),
+        "L": missed["L"]["rms"] / float(np.abs(peaks.L).max()),
+        "velocity": missed["velocity"]["rms"] / float(np.linalg.norm(peaks.com_velocity, axis=1).max()),
         "rho": missed["rho"]["relative_rms"],
+        "com": float(np.linalg.norm(np.subtract(*ways), axis=1).max()),
     }
+
+
+def followed_table(plans: Iterable[JumpPlan]) -> list[dict[str, float | str]]:
+    """Median and worst of :func:`launch_followed` over jumps, beside :data:`ASKED` and whether that holds."""
+    found = [launch_followed(plan) for plan in plans]
+    rows: list[dict[str, float | str]] = []
+    for key, (what, most, per, unit) in ASKED.items():
+        sizes = [per * one[key] for one in found]
+        row = {"in the launch": what, "unit": unit, "median": float(np.median(sizes)), "worst": max(sizes)}
+        row |= {"at most": "" if most is None else most}
+        rows.append(row | {"holds": "" if most is None else "yes" if max(sizes) <= most else "does not hold"})
+    return rows
+
+
+def _asked(plan: JumpPlan) -> tuple[Any, Any]:
+    """Stage 1's launch and flight at the instants of the tape, each at the same share of its phase."""
+    tape, srmp, k = plan.tape, plan.srmp, plan.tape.takeoff_index
+    toe = float(tape.extra["planar_toe_phase_start"])
+    ends = [0.0, srmp.launch_s - srmp.toe_s, srmp.launch_s]
+    air = tape.t[k:] - tape.takeoff_time
+    asked = srmp.at(np.interp(tape.t[:k], [0.0, toe, tape.takeoff_time], ends), air * srmp.flight_s / air[-1])
+    return asked.launch, asked.flight
 
 
 def _rho_rate(plan: JumpPlan) -> np.ndarray:

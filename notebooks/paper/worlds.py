@@ -26,7 +26,7 @@ from jumplab.sim import ENGINES, STEP_S, Perturbation, Ranges, Scene, Simulation
 from jumplab.studies.margins import MarginReport, ranges_at
 from jumplab.studies.study import in_parallel
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
-from paper import logs
+from paper import logs, runs
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
 FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), 200, 11
@@ -272,6 +272,56 @@ def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return table
 
 
+def counts() -> list[str]:
+    """Rows of the page on validity: perturbed robots that stand in PyBullet and in MuJoCo, as the files have them.
+
+    ``python -m paper.worlds --counts`` prints them.
+    """
+    lines, kept, flown = [], stored(), stored(FLIPS)
+    many = {engine: runs.stored(engine, "delay_s") for engine in ENGINES}
+
+    def row(jump: str, path: Path, landed: Iterable[list[bool]], off: str = "") -> None:
+        shares = " | ".join(f"{sum(here)} of {len(here)}" for here in landed)
+        lines.append(f'| {jump} | "{runs.origin(path)[0]}" | {shares} | {off} |')
+
+    far_m = [t.foot_distance_m - 1.0 for here in many.values() for t in here if t.landed]
+    off = f"{100 * np.std(far_m):.0f} cm, {100 * np.abs(far_m).max():.0f} cm"
+    row("default jump, the usual ranges, re-aimed", runs.LOG, ([t.landed for t in x] for x in many.values()), off)
+    for world, aimed in product(reversed(WORLDS), (True, False)):
+        if not (aimed and world == "the usual ranges"):  # more of these stand above
+            mine = [r for r in kept if (r["world"], r["re-aim"]) == (world, aimed)]
+            found = ([r["landed"] for r in mine if r["engine"] == engine] for engine in ENGINES)
+            row(f"default jump, {world}, {'re-aimed' if aimed else 'played plainly'}", LOG, found)
+    found = ([r["landed"] for r in flown if r["engine"] == engine] for engine in ENGINES)
+    row("backflip of 0.5 m, robust plan, the usual ranges, re-aimed", FLIPS, found)
+    return lines
+
+
+def contact_counts() -> list[str]:
+    """Rows of the page on validity: the drawn plans on MuJoCo's default contacts, and the largest misses of those that
+    stand.
+
+    ``python -m paper.worlds --counts`` prints them, too.
+    """
+    kept = [r for r in logs.rows(DRAWN) if r["world"] == "MuJoCo, usual" and "stands" in r]
+    lines = []
+    for jumps, aside, robots in (
+        ("straight ahead, all robots", False, tuple(HUMANOIDS)),
+        ("to the side and with turns, `bhr`", True, ("bhr",)),
+        ("to the side and with turns, `g1_arms`", True, ("g1_arms",)),
+    ):
+        cells = []
+        for way in WAYS:
+            names = [(r, *r["case"].split()) for r in kept if r["way"] == way]
+            here = [r for r, robot, _, kind in names if robot in robots and (kind in ("side", "turn")) == aside]
+            stand = [r for r in here if r["stands"]]
+            miss_m, apex_m, tilt_deg = (max(abs(r[key]) for r in stand) for key in ("miss_m", "apex_m", "tilt_deg"))
+            off = f"{100 * miss_m:.0f} cm, {100 * apex_m:.0f} cm, {tilt_deg:.0f}°"
+            cells += [f"{len(stand)} of {len(here)}", off]
+        lines.append(f"| {jumps} | {' | '.join(cells)} |")
+    return lines
+
+
 def share(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Number of the re-aimed robots of ``rows`` that land, with Wilson's 95 % interval, and the causes of the falls."""
     landed = sum(r["landed"] for r in rows)
@@ -282,6 +332,8 @@ def share(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    if sys.argv[1] == "--counts":
+        sys.exit(print(*counts(), *contact_counts(), sep="\n"))
     made = {"--flips": flips, "--contacts": contacts}.get(sys.argv[1], study)
     rest = sys.argv[1 + (made is not study) :]
     made(rest[0], jobs=int(rest[1]) if len(rest) > 1 else None)
