@@ -96,7 +96,7 @@ def torch_like(index: bytes, numbers: bytes = b"") -> bytes:
 
 
 class Code:
-    """What a pickle may run."""
+    """Functions that a pickle may run."""
 
     def __reduce__(self):
         import os

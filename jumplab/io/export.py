@@ -220,8 +220,9 @@ def retargeted(whole: Whole, x: Motion, fps: float) -> dict[str, object]:
 
 
 def states(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
-    """What ProtoMotions reads: joints depth-first; of all links places, rotations x y z w,
-    velocities of their origins and whether they touch the ground, as the feet do; 32-bit floats.
+    """States as ProtoMotions reads them: joints depth-first; of all links places, rotations
+    x y z w, velocities of their origins and whether they touch the ground, as the feet do; 32-bit
+    floats.
     """
     arrays = tracked(whole, x, fps)
     touching = np.zeros(arrays["body_pos_w"].shape[:2], bool)

@@ -54,7 +54,7 @@ class Dynamics:
         self._tips = [(self.model.getJointId(name), place * tip) for name, place in whole.feet]
 
     def held(self, q: np.ndarray, carries: np.ndarray) -> Held:
-        """What the ground holds of the feet that ``carries`` (2,) names."""
+        """Joint, place and rows that the ground holds, of each foot that ``carries`` (2,) names."""
         pin.forwardKinematics(self.model, self.data, q)
         out = []
         for (joint, place), down in zip(self._tips, carries, strict=True):

@@ -109,9 +109,9 @@ def _rebuilt(numbers: np.ndarray, first: int, shape: tuple, strides: tuple, *res
 
 
 def read_tensors(raw: bytes) -> Any | None:
-    """What ``torch.save`` wrote, tensors as arrays; None of other zip files.
+    """Content of a file by ``torch.save``, tensors as arrays; None of other zip files.
 
-    Raises :class:`pickle.UnpicklingError` for what is no plain data.
+    Raises :class:`pickle.UnpicklingError` if the content is no plain data.
     """
     with zipfile.ZipFile(io.BytesIO(raw)) as file:
         names = [name for name in file.namelist() if name.endswith(INDEX)]

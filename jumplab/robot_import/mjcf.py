@@ -165,7 +165,7 @@ def _always_from_geoms(spec: mujoco.MjSpec) -> bool:
 
 
 def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Make points of the meshes that are of no foot and weigh nothing: MuJoCo takes a minute for
+    """Replace massless meshes that belong to no foot by points: MuJoCo takes a minute for
     the hulls of a thousand.
     """
     below = {b.name: len(b.find_all("joint")) - len(list(b.joints)) for b in spec.bodies}

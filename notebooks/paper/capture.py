@@ -39,7 +39,7 @@ def _row(planner: Planner, task: JumpTask) -> dict[str, Any]:
 
 
 def line(path: Path = LOG) -> str:
-    """How far off the soles the point is in jumps that land in both engines, and in those that land in neither."""
+    """Distances of the point off the soles, in jumps that land in both engines, and in those that land in neither."""
     rows = logs.rows(path)
     shares = {count: [r["capture [%]"] for r in rows if sum(r["stands"].values()) == count] for count in (0, 1, 2)}
     fall = f"those with {min(shares[0]):.0f} % and more in neither" if shares[0] else "and none falls in both"

@@ -131,7 +131,7 @@ def _solved(planner: Planner, method: str, case: Case) -> tuple[WholeBodyPlan, A
 
 
 def effort(plan: WholeBodyPlan) -> float:
-    """What a plan costs besides following stage 1 [1], all methods weighed alike."""
+    """Cost of a plan besides following stage 1 [1], all methods weighed alike."""
     costs = [r for r in plan.solution.cost_shares if r["name"] in EFFORT]
     return sum(r["cost"] * EFFORT[r["name"]] / r["weight"] for r in costs)
 

@@ -96,7 +96,8 @@ def jump_tracking(plan: JumpPlan) -> dict[str, dict[str, dict[str, float]]]:
 
 def launch_followed(plan: JumpPlan) -> dict[str, float]:
     """Differences of the launch from stage 1's: rms of ``L`` and ``velocity`` as shares of their peaks, and of ``rho``
-    as a share of its mean (Sec. V-A); ``com``, the largest distance of the CoM from its path, both from their starts [m].
+    as a share of its mean (Sec. V-A); ``com``, the largest distance of the CoM from its
+    path, both from their starts [m].
     """
     missed, peaks = jump_tracking(plan)["launch"], plan.srmp.launch
     asked, k = _asked(plan)[0], plan.tape.takeoff_index
