@@ -21,7 +21,7 @@ from jumplab.task import JumpTask
 from paper import logs
 from paper.basin import landing_basin
 
-LOG, ROBOTS = Path(__file__).with_name("trials.jsonl"), 250  # drawn in each engine
+LOG, ROBOTS = Path(__file__).with_name("trials.jsonl"), 100  # drawn in each engine
 
 
 def outcomes(runs: Mapping[str, SimulationResult], task: JumpTask) -> list[dict]:
