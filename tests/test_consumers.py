@@ -116,6 +116,14 @@ def test_tensors_with_code_or_of_the_wrong_size_are_refused(bhr, tmp_path, monke
     path.write_bytes(torch_like(index, b"1234"))
     with pytest.raises(InputError, match=r"bad.motion: not a readable clip \(ValueError\)"):
         read_clips(path, bhr)
+    with zipfile.ZipFile(io.BytesIO(tensor_file({"a": np.ones(1)}))) as file:
+        index, one = file.read("archive/data.pkl"), file.read("archive/data/0")
+    shape, stride = (pickle.dumps(x, protocol=2)[2:-1] for x in ((1,), (1,)))
+    assert shape + stride in index
+    many, still = (pickle.dumps(x, protocol=2)[2:-1] for x in ((10**10,), (0,)))
+    path.write_bytes(torch_like(index.replace(shape + stride, many + still), one))  # 80 GB, of one number
+    with pytest.raises(InputError, match=r"bad.motion: not a readable clip \(ValueError\)"):
+        read_clips(path, bhr)
 
 
 # platforms

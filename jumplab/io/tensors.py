@@ -101,7 +101,8 @@ def _rebuilt(numbers: np.ndarray, first: int, shape: tuple, strides: tuple, *res
     wanted = np.empty(0)
     if math.prod(shape):
         last = first + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
-        if min(first, *shape, *strides, last, 0) < 0 or last >= len(numbers):
+        fits = last < len(numbers) and math.prod(shape) <= len(numbers)  # no copies of one number
+        if min(first, *shape, *strides, last, 0) < 0 or not fits:
             raise ValueError(f"a tensor of shape {shape} does not fit its numbers")
         steps = [numbers.itemsize * step for step in strides]
         wanted = np.lib.stride_tricks.as_strided(numbers[first:], shape, steps)
