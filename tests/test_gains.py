@@ -97,12 +97,13 @@ def test_gains_count_for_the_errors_of_mujoco(tmp_path, monkeypatch):
     error = 1e-5 * rng.normal(0, 1, 2 * NV)
     there = np.array([pin.integrate(MODEL, row, error[:NV]) for row in q])
     beside = Motion(t, there, motion.v + error[NV:], none, motion.phase, "plan")
-    there_qpos, there_qvel = export._qpos_qvel(WHOLE.frames(beside, 1000.0))
+    other = export.write("mujoco", beside, WHOLE.robot, tmp_path / "beside")
     dq = np.zeros(model.nv)
-    mujoco.mj_differentiatePos(model, dq, 1.0, qpos, there_qpos[0])
-    asked = gain[0] @ np.concatenate([dq, there_qvel[0] - qvel])
+    with np.load(other / "motion.npz") as x:
+        mujoco.mj_differentiatePos(model, dq, 1.0, qpos, x["qpos"][0])
+        asked = gain[0] @ np.concatenate([dq, x["qvel"][0] - qvel])
 
-    monkeypatch.setattr(gains, "_from_mujoco", lambda q, v, order: np.eye(2 * NV))
+    monkeypatch.setattr(gains, "from_mujoco", lambda q, v, order: np.eye(2 * NV))
     own = gains.gains(WHOLE, WHOLE.frames(motion, 1000.0))[1][0] @ error
     assert np.abs(asked - own).max() < 1e-3 * np.abs(own).max()
 

@@ -1,5 +1,6 @@
 """Clips mended: the schedule that is read from them, and one public clip from file to a robot that stands."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -149,3 +150,5 @@ def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
     folder = export.write("mujoco", Motion.of(run), mended.plan.robot, tmp_path / "mujoco")
     done = subprocess.run([sys.executable, str(folder / "play.py")], capture_output=True, text=True)
     assert done.stdout.startswith("stands"), done.stderr
+    moved, planned = (np.array(text.split(), float) for text in re.findall(r"\[(.*?)\]", done.stdout))
+    assert np.linalg.norm(moved - planned) < 0.1, done.stdout

@@ -6,12 +6,16 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from fixtures_robots import reduction_error
 
+import jumplab as jl
 from jumplab.auditing import audit
 from jumplab.cli.main import main
 from jumplab.errors import RobotError, SolverError
+from jumplab.io.motion import Motion
+from jumplab.io.whole import Whole
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED, read_toml
 from jumplab.robot_import.checkup import check
@@ -225,3 +229,21 @@ def test_the_book_has_the_stored_jumps():
     for line in shipped.verdicts():
         name, *cells = map(str, line.values())
         assert re.search(rf"^\| `{name}`, [^|]+ \| {re.escape(' | '.join(cells))} \|$", page, re.M), line
+
+
+@here
+@pytest.mark.slow
+def test_the_book_has_the_torques_of_held_waists():
+    """A plan holds these joints rigidly; they would need more than their motors have."""
+    page = (Path(__file__).parent.parent / "notebooks" / "book" / "validity.md").read_text(encoding="utf-8")
+    needed, motors = [], set()
+    for name in ("g1", "g1_arms"):
+        plan = jl.plan(jl.JumpTask(0.4, 0.2), name)
+        whole = Whole(plan.robot)
+        k = whole.joints.index("waist_pitch_joint")
+        needed.append(np.abs(whole.frames(Motion.of(plan.tape), 1000.0).tau[:, k]).max())
+        motors.add(whole.model.upperEffortLimit[6:][whole.order][k])
+    counted = re.search(
+        r"`g1`\s+would have to hold (\d+) N m, that of `g1_arms` (\d+) N m; its motor has (\d+)\.", page
+    )
+    assert [*map(float, counted.groups())] == pytest.approx([*needed, *motors], abs=1.0)

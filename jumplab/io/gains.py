@@ -174,11 +174,11 @@ def gains(whole: Whole, x: Motion) -> tuple[np.ndarray, np.ndarray]:
             held = dynamics.held(q[k], x.contact[k])
             step = discrete(*dynamics.derivatives(q[k], v[k], tau[k], held))
         gain, value = riccati(*step, *cost, value)
-        out[k] = (gain @ _from_mujoco(q[k], v[k], order))[order]
+        out[k] = (gain @ from_mujoco(q[k], v[k], order))[order]
     return x.t, out
 
 
-def _from_mujoco(q: np.ndarray, v: np.ndarray, order: np.ndarray) -> np.ndarray:
+def from_mujoco(q: np.ndarray, v: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Errors (2 nv, 2 nv) in Pinocchio's axes and order of MuJoCo's small ones."""
     nv = len(v)
     back = Rotation.from_quat(q[3:7]).as_matrix().T
