@@ -50,9 +50,12 @@ def test_rows_of_other_code_are_told(tmp_path, now, bhr):
     ]
     made = logs.lines(path)[-1][1]
     assert made["robot"] == f"bhr {bhr.hash}" and made["code"]["sim/a.py"] == "00000001" and "cores" in made["machine"]
+    with path.open("a") as file:
+        file.write('{"stamp": null}\n{"n": 4}\n')
+    assert [made is None for _, made in logs.lines(path)] == [True, False, False, False, True]
     with logs.keep(path, lambda row: row["n"]):
         pass
-    assert len(path.read_text().splitlines()) == 7  # nothing was added: no stamp either
+    assert len(path.read_text().splitlines()) == 9  # nothing was added: no stamp either
 
 
 def test_whole_logs_and_tables(tmp_path, now):

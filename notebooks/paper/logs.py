@@ -100,7 +100,7 @@ def age(stamps: Iterable[Mapping[str, Any] | None]) -> str:
 
 
 def lines(path: Path) -> list[tuple[Row, Row | None]]:
-    """Rows of a log, each with the stamp above it, if there is one."""
+    """Rows of a log, each with the stamp above it, if there is one; ``null`` for rows from before there were stamps."""
     found, made = [], None
     for line in path.read_text(encoding="utf-8").splitlines():
         row = json.loads(line)
