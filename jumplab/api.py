@@ -106,8 +106,8 @@ def plan(
         alone = robust is None and method == USUAL and starts == 1
         if not (alone and (contacts is None or like is None)):
             raise InputError(
-                "a contact schedule, or a jump like a clip, is planned by the whole-body program; "
-                "leave method, robust and starts out, and give one of the two"
+                "a contact schedule, or a jump like a clip, is planned by the whole-body program: "
+                "give only one of contacts and like, and leave out method, robust and starts"
             )
         with patience(patience_s):
             made = _followed(task, robot, contacts, like, changes)

@@ -110,7 +110,9 @@ def xml(text: str | bytes, where: str, error: type[InputError] = InputError) -> 
     :class:`xml.etree.ElementTree.ParseError` if it is none.
     """
     if (count := text.count("<" if isinstance(text, str) else b"<")) > MOST_TAGS:
-        raise error(f"{where}: has {count} XML tags, a robot at most {MOST_TAGS}; is it one?")
+        raise error(
+            f"{where}: has {count} XML tags, a robot at most {MOST_TAGS}; give the file of a robot"
+        )
     return ElementTree.fromstring(text)
 
 

@@ -108,6 +108,6 @@ class JumpTask(Shown):
         if not rest >= 0:
             raise InputError(
                 f"a CoM rise of {self.height_m:g} m cannot reach a touchdown "
-                f"{com_rise_at_touchdown_m:.3f} m above take-off; it takes at least that height"
+                f"{com_rise_at_touchdown_m:.3f} m above take-off; the rise must be at least that"
             )
         return (v + math.sqrt(rest)) / g

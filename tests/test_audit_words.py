@@ -215,7 +215,7 @@ def test_a_tape_of_another_robot_word_for_word():
         "tape: the contact frame 'tail' is not a link of the robot 'bhr'": {
             "contact_frames": np.array(["left_foot", "tail"])
         },
-        "tape: it names no contact frame; a jump needs at least one foot": {
+        "tape: it names no contact frame, but a jump needs a foot; plan the jump again": {
             "contact_frames": tape.contact_frames[:0], "f": tape.f[:, :0]
         },
     }  # fmt: skip

@@ -89,20 +89,20 @@ def off(**changed):
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        ({"touchdown_s": 1.506}, "0.006 s apart in time of touchdown, at most 0.005 s"),
-        ({"foot_distance_touchdown_m": 0.589}, "0.011 m apart in toes at touchdown, at most 0.01 m"),
-        ({"foot_distance_m": 0.611}, "0.011 m apart in toes in the end, at most 0.01 m"),
-        ({"com_rise_m": 0.32}, "0.02 m apart in rise of the CoM, at most 0.01 m"),
-        ({"touchdown_trunk_pitch_rad": 0.32}, "0.02 rad apart in trunk pitch at touchdown, at most 0.0175 rad"),
-        ({"touchdown_trunk_rate": -0.2}, "0.3 rad/s apart in trunk pitch rate at touchdown, at most 0.2 rad/s"),
-        ({"landing_impulse": (-20.0, 150.0)}, "0.222 apart in vertical impulse of landing, at most 0.1"),
-        ({"landing_force_n": 3000.0}, "0.4 apart in largest force of landing, at most 0.15"),
+        ({"touchdown_s": 1.506}, "differ by 0.006 s in time of touchdown (limit 0.005 s)"),
+        ({"foot_distance_touchdown_m": 0.589}, "differ by 0.011 m in toes at touchdown (limit 0.01 m)"),
+        ({"foot_distance_m": 0.611}, "differ by 0.011 m in toes in the end (limit 0.01 m)"),
+        ({"com_rise_m": 0.32}, "differ by 0.02 m in rise of the CoM (limit 0.01 m)"),
+        ({"touchdown_trunk_pitch_rad": 0.32}, "differ by 0.02 rad in trunk pitch at touchdown (limit 0.0175 rad)"),
+        ({"touchdown_trunk_rate": -0.2}, "differ by 0.3 rad/s in trunk pitch rate at touchdown (limit 0.2 rad/s)"),
+        ({"landing_impulse": (-20.0, 150.0)}, "differ by 0.222 in vertical impulse of landing (limit 0.1)"),
+        ({"landing_force_n": 3000.0}, "differ by 0.4 in largest force of landing (limit 0.15)"),
     ],
 )
 def test_each_limit_can_be_failed(folder, physics, changed, sentence):
     physics.say = off(**changed)
     found = certify(folder, 1, jobs=1)
-    assert found.failures == [f"pd mode: the engines are {sentence}"] and not found.passed
+    assert found.failures == [f"pd mode: the engines {sentence}"] and not found.passed
     assert sentence in certificate_page(found).html
 
 
@@ -117,7 +117,7 @@ def test_perturbed_robots_must_fare_alike(folder, physics, capsys, monkeypatch):
     physics.say = say
     assert cli.main(["certify", str(folder), "--n", "4", "--jobs", "1"]) == 3
     said = capsys.readouterr()
-    verdict = "position mode: 3 of 4 perturbed robots fare alike, at least 97 % are asked for"
+    verdict = "position mode: 3 of 4 perturbed robots have the same outcome in every engine, must be at least 97 %"
     assert said.err == f"jumplab: not certified: {verdict}; see certificate.html in {str(folder)!r}\n"
     assert store.read_json(folder / "certificate.json")["failures"] == [verdict]
     told = "robot 2: bullet: trunk touched the ground 0.30 s after touchdown; mujoco: stood for 3.05 s"
@@ -140,7 +140,7 @@ def test_the_median_of_perturbed_robots_is_held_to_the_limits(folder, physics):
     assert certify(folder, 3, jobs=1).passed
     odd = far
     (folder / "trials.jsonl").unlink()
-    words = "{} mode: perturbed robots are 0.1 m apart in toes in the end (median), at most 0.01"
+    words = "{} mode: for perturbed robots the engines differ by 0.1 m in toes in the end (median, limit 0.01 m)"
     assert certify(folder, 3, jobs=1).failures == [words.format("position"), words.format("pd")]
 
 

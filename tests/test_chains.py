@@ -44,7 +44,7 @@ def test_course_of_numbers():
         (([0.5, 0.5], 0.3, None, None, [1.0] * 3), "3 turns for 2 distances: give one per jump"),
         (
             ([0.5, 0.5], 0.3, [0.1, 0.1], None, [1.0, 0.0]),
-            "platforms lie on a straight way: leave them away, or ask for neither sides nor turns",
+            "platforms need a straight course; leave out the platforms, or the sides and turns",
         ),
     ],
 )

@@ -92,7 +92,7 @@ def test_each_limit_decides(name):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("it jumps", "1 m"), "there is no claim 'it jumps'; choose of jumps, time, chain, size,"),
+        (("it jumps", "1 m"), "there is no claim 'it jumps'; choose from jumps, time, chain, size,"),
         (("time", " ", {"slowest plan [CPU s]": 1}), "measured of a claim must be a text, got ' '"),
         (("time", 1.0), "measured of a claim must be a text, got 1.0"),
         (("time", "1 s"), "claim 'time': measured are no values; it needs slowest plan [CPU s] ≤ 10"),

@@ -88,8 +88,8 @@ REFUSALS = [
     ("trials . --jobs 0", "--jobs must be a whole number from 1 to 4096, got '0'"),
     ("trials . --reaim yes", "unrecognized arguments: yes; " + HELP),
     ("run --parameter fast", "--parameter must be NAME=VALUE, got 'fast'"),
-    ("run -p height_m=1", "--parameter height_m is given twice, or has an option of its own"),
-    ("run -p out=1", "the parameter 'out' is set by the runner; use its own argument out"),
+    ("run -p height_m=1", "--parameter height_m is given twice, or has an option of its own; set it once"),
+    ("run -p out=1", "the runner sets the notebook parameter 'out' itself; pass the folder as its argument out"),
     ("run --out /dev/null/x", "the folder '/dev/null/x' cannot be written (Not a directory); choose another one"),
 ]
 

@@ -101,7 +101,7 @@ def test_clips_that_failed_are_tried_again(world, tmp_path):
 def test_engines_that_do_not_agree_leave_a_clip_out(world, tmp_path, capsys):
     world.say = lambda engine: {"com_rise_m": 0.32} if engine == "mujoco" else {}
     code, _, err = run(capsys, "clips", "--out", tmp_path, "--jobs", "1", "--only", "forward-1")
-    apart = "position mode: the engines are 0.02 m apart in rise of the CoM, at most 0.01 m"
+    apart = "position mode: the engines differ by 0.02 m in rise of the CoM (limit 0.01 m)"
     assert code == 3 and err == f"jumplab: no clip of bhr passed: {apart}\n"
     assert not (tmp_path / "forward-1" / "simulated_mjlab.npz").exists()
 
@@ -128,7 +128,7 @@ def test_a_stopped_library_goes_on(world, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--only", "forward-9"], "there is no clip 'forward-9'; choose of forward-1, forward-2"),
+        (["--only", "forward-9"], "there is no clip 'forward-9'; choose from forward-1, forward-2"),
         (["--fps", "0"], "rate = 0 per second must lie above 0 and not above 10000"),
         (["--jobs", "0"], "--jobs must be a whole number from 1 to 4096, got '0'"),
     ],

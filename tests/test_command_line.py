@@ -65,11 +65,12 @@ def test_quiet_says_nothing(capsys, planned):
 
 
 IGNORED = [
-    ("view {} --movie a.gif --out b.html", "--out names the page, and --movie is given instead of it; leave it out"),
-    ("chain --distance-m 0.5 --jobs 2 --out x", "--jobs is for several --runs; leave it out"),
-    ("chain --distance-m 0.5 --ranges wide --out x", "--ranges says how perturbed robots differ, and neither --seed "
+    ("view {} --movie a.gif --out b.html", "--out names the page, but --movie makes an animation "
+     "instead; leave it out"),
+    ("chain --distance-m 0.5 --jobs 2 --out x", "--jobs has an effect only with several --runs; leave it out"),
+    ("chain --distance-m 0.5 --ranges wide --out x", "--ranges is for perturbed robots, but neither --seed "
      "nor --runs asks for one; leave it out"),
-    ("sweep --out x --cluster tcp://a:1 --jobs 2", "--jobs is for processes of this machine, and --cluster does the "
+    ("sweep --out x --cluster tcp://a:1 --jobs 2", "--jobs sets processes of this machine, but --cluster does the "
      "work elsewhere; leave it out"),
     ("robot check g1 --repair inertia", "--repair is for a bare URDF; a configuration has its own [source] repair, "
      "so leave it out"),

@@ -184,8 +184,8 @@ WRITE = "write L and R for flat feet, l and r for toes, left before right, or '-
 WAIT = "a schedule begins on flat feet, at rest; there is no support to wait on"
 ALONE = "the schedule begins on one foot without a place for the"
 AFTER = "a foot lands only after it has left the ground"
-STEP = "the ground has one step up or down; "
-STEP += "give all places after it the same up_m, and all before it none"
+STEP = "the ground can have only one step up or down; "
+STEP += "give all places after the step the same up_m, and all before it none"
 CAME = "feet come down 2 times (left in phase '4 LR', right in phase '4 LR')"
 
 

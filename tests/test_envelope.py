@@ -144,7 +144,9 @@ def test_the_picture_has_every_reason():
 def test_two_maps_at_once_are_refused(capsys, tmp_path):
     argv = ["envelope", "--out", str(tmp_path / "x"), "--side-m", "0:0.4:3"]
     assert main([*argv, "--yaw-deg", "0:90:3"]) == 2
-    assert capsys.readouterr().err == "jumplab: --side-m and --yaw-deg are two maps; leave one of them out\n"
+    assert (
+        capsys.readouterr().err == "jumplab: --side-m and --yaw-deg ask for two different maps; leave one of them out\n"
+    )
     assert main([*argv, "--height-m", "0.3,0.4"]) == 2
     said = "jumplab: a map of sides has one height, got 2; give --height-m one number\n"
     assert capsys.readouterr().err == said

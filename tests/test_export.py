@@ -298,7 +298,7 @@ def test_a_robot_that_was_changed_is_not_the_published_one(tmp_path):
     longer = robot.urdf[:at] + robot.urdf[at:].replace(place[0], f'xyz="{x} {y} {z - 0.05}"', 1)
     other = Robot.from_text(longer, robot.config_text)
     with pytest.raises(InputError, match=(
-        rf"^robot {robot.name}: joint '.*' is 50 mm off the published robot's, at most 10; "
+        rf"^robot {robot.name}: joint '.*' lies 50 mm from its place in the published robot, at most 10; "
         r"import the changed robot's own URDF$"
     )):  # fmt: skip
         Whole(other).frames(tumbling(other, 0.01), 50.0)

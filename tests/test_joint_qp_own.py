@@ -264,11 +264,11 @@ REFUSED = [
      "'joint qp' for terms that join them"),
     ({"terms": {"launch": [3]}}, "an own term of 'joint qp/launch' must be a Term, got 3"),
     ({"terms": {"launch": [term(swing, "com", 1.0)]}},
-     "term 'com' of 'joint qp/launch': the name is taken; give it one of its own"),
-    ({"terms": {"launch": [term(swing, weight=1.0)] * 2}}, f"{LAUNCH}: the name is taken; give it one of its own"),
+     "term 'com' of 'joint qp/launch': another term has this name; choose another one"),
+    ({"terms": {"launch": [term(swing, weight=1.0)] * 2}}, f"{LAUNCH}: another term has this name; choose another one"),
     ({"terms": {"launch": [term(swing, "a/b", 1.0)]}}, "term 'a/b' of 'joint qp/launch': a name must not hold a '/'"),
     ({"terms": {"launch": [jl.Term("mine", "ours", "m", "end", swing, 1.0)]}},
-     f"{LAUNCH}: at = 'end', skip = (0, 0); every step has its own QP, with at = 'node' and no skip"),
+     f"{LAUNCH}: at = 'end', skip = (0, 0), must be 'node' and (0, 0), since every step has its own QP"),
     ({"terms": {"launch": [term(swing, weight=-1.0)]}}, "weight 'mine' = -1.0: it must be a number of 0 or more"),
     ({"terms": {"launch": [term(lambda p: 1.0, weight=1.0)]}},
      f"{LAUNCH}: its expression is float, must be rows that depend on the accelerations, such as "
@@ -279,8 +279,8 @@ REFUSED = [
      f"{LAUNCH}: its expression fails (two quantities that depend on the accelerations were multiplied; a QP's rows "
      "are affine)"),
     ({"terms": {"launch": [term(swing, lower=[1, 2, 3], upper=9)]}},
-     f"{LAUNCH}: lower = [1, 2, 3] does not fit its expression, which has 2 rows"),
-    ({"terms": {"launch": [term(swing, lower="low")]}}, f"{LAUNCH}: lower = 'low' is no number"),
+     f"{LAUNCH}: lower = [1, 2, 3] does not fit its expression, which has 2 rows; give one number, or one per row"),
+    ({"terms": {"launch": [term(swing, lower="low")]}}, f"{LAUNCH}: lower = 'low' is not a number"),
     ({"terms": {"launch": [term(swing, lower=2.0, upper=1.0)]}}, f"{LAUNCH}: lower = 2.0 is above upper = 1.0"),
     ({"terms": {"flight": [term(lambda p: p.wrench, weight=1.0)]}},
      "term 'mine' of 'joint qp/flight': its expression fails (a point of this phase has no 'wrench'; it has L, L_rate, "
@@ -291,7 +291,7 @@ REFUSED = [
     ({"weights": {"torque": 2.0}}, "joint qp: 'torque' is a constraint and has no weight; switch it off instead"),
     ({"weights": {"com": -2}}, "weight 'com' of 'joint qp' = -2: its factor must be a number of 0 or more"),
     ({"off": ("base dynamics",)},
-     "term 'base dynamics' links the motion to one; it cannot be switched off"),
+     "term 'base dynamics' ties the plan into one motion, as dynamics and links do; it cannot be switched off"),
 ]  # fmt: skip
 
 

@@ -81,7 +81,7 @@ def test_a_stance_too_wide_for_flat_soles_is_refused():
     q = clip.q.copy()
     joints = [7 + clip.robot.joint_names.index(f"{side}_hip_roll_joint") for side in ("left", "right")]
     q[:, joints] += [0.5, -0.5]
-    with pytest.raises(InfeasibleError, match="where it begins, both legs at the ends of their ranges leave a sole"):
+    with pytest.raises(InfeasibleError, match="at its start no posture within the joints' ranges puts both soles flat"):
         jl.mend(replace(clip, q=q))
 
 
@@ -108,11 +108,11 @@ def test_a_clip_that_is_followed_to_a_target_lands_there():
 
 @NO_ROBOTS
 def test_what_no_clip_shows_is_refused():
-    with pytest.raises(InputError, match="like a clip is one on level ground that does not turn over"):
+    with pytest.raises(InputError, match="like a clip needs level ground and no flip"):
         jl.plan(jl.JumpTask(0.5, 0.3, platform_m=0.1), "g1", like=CLIPS / "jump_forward_level2.pkl")
-    with pytest.raises(InputError, match="its feet carry as LR R r - L LR; a jump to a target is like one"):
+    with pytest.raises(InputError, match="its contacts are LR R r - L LR; a jump to a target needs a clip that"):
         jl.plan(GOAL, "g1", like=CLIPS / "side_jump_level2.pkl")
-    with pytest.raises(InputError, match="leave method, robust and starts out, and give one of the two"):
+    with pytest.raises(InputError, match="give only one of contacts and like, and leave out method, robust and starts"):
         jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl", method="three-step")
 
 
@@ -120,7 +120,7 @@ def test_what_no_clip_shows_is_refused():
 def test_the_command_plans_in_the_manner_of_a_clip(tmp_path, capsys):
     clip = str(CLIPS / "side_jump_level2.pkl")
     assert main(["plan", "--robot", "g1", "--like", clip, "--out", str(tmp_path)]) == 2
-    assert "its feet carry as LR R r - L LR" in capsys.readouterr().err
+    assert "its contacts are LR R r - L LR" in capsys.readouterr().err
 
 
 @NO_ROBOTS

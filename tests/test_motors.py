@@ -118,12 +118,12 @@ def test_refused(told, sentence):
 
 
 @pytest.mark.parametrize("told, sentence", [
-    ({"armature": {"left_knee": -1.0}}, "armature: left_knee = -1 must be of a joint that moves, and at least 0"),
-    ({"friction": {"neck": 1.0}}, "friction: neck = 1 must be of a joint that moves, and at least 0"),
+    ({"armature": {"left_knee": -1.0}}, "armature: left_knee = -1 must name a joint that moves, and be at least 0"),
+    ({"friction": {"neck": 1.0}}, "friction: neck = 1 must name a joint that moves, and be at least 0"),
     ({"no_load_ratios": {"left_knee": 0.9}},
-     "no_load_ratios: left_knee = 0.9 must be of a joint that moves, and at least 1"),
+     "no_load_ratios: left_knee = 0.9 must name a joint that moves, and be at least 1"),
     ({"no_load_ratios": {"left_knee": 1.2}, "corner_speed_ratios": {"left_knee": 1.2}},
-     "corner_speed_ratios: left_knee = 1.2 must be of a joint, and between 0 and 1.2"),
+     "corner_speed_ratios: left_knee = 1.2 must name a joint, and lie between 0 and 1.2"),
 ])  # fmt: skip
 def test_refused_of_a_robot(bhr, told, sentence):
     assert refused(lambda: with_motors(bhr, (), **told)) == f"robot bhr: {sentence}"

@@ -150,7 +150,7 @@ def test_failing_notebook_stops_the_chain(tmp_path, cell, kind, sentence):
             {"distance": 1.0},
             "unknown notebook parameter 'distance'; the notebooks have distance_m, figures, height_m, n, out, robot",
         ),
-        ({"out": "x"}, "the parameter 'out' is set by the runner; use its own argument out"),
+        ({"out": "x"}, "the runner sets the notebook parameter 'out' itself; pass the folder as its argument out"),
         ({"distance_m": "far"}, "parameter distance_m must be a number, got 'far'"),
         ({"distance_m": True}, "parameter distance_m must be a number, got True"),
         ({"distance_m": float("nan")}, "parameter distance_m must be finite, got nan"),

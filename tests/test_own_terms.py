@@ -89,13 +89,16 @@ def test_a_problem_without_a_bound():
 @pytest.mark.parametrize(
     ("term", "sentence"),
     [
-        (cost(lambda p: p.q, "jerk"), "term 'jerk' of 'toy/two': the name is taken; give it one of its own"),
+        (cost(lambda p: p.q, "jerk"), "term 'jerk' of 'toy/two': another term has this name; choose another one"),
         (
             cost(lambda p: p.q, "jerk chain"),
-            "term 'jerk chain' of 'toy/two': the name is taken; give it one of its own",
+            "term 'jerk chain' of 'toy/two': another term has this name; choose another one",
         ),
         (cost(lambda p: p.q, "a/b"), "term 'a/b' of 'toy/two': a name must not hold a '/'"),
-        (cost(lambda p: p.q, at="problem"), "term 'x' of 'toy/two': at = 'problem' belongs to 'toy' itself"),
+        (
+            cost(lambda p: p.q, at="problem"),
+            "term 'x' of 'toy/two': at = 'problem' joins phases; add the term to 'toy' instead",
+        ),
         (cost(lambda p: p.q, weight=-1.0), "weight 'x' = -1.0: it must be a number of 0 or more"),
         (cost(lambda p: p.q, weight=float("nan")), "weight 'x' = nan: it must be a number of 0 or more"),
         (
@@ -116,17 +119,18 @@ def test_a_problem_without_a_bound():
         ),
         (
             cost(lambda p: ca.SX.sym("stray") * p.q),
-            "term 'x' of 'toy/two': it uses symbols that are not its point's (stray)",
+            "term 'x' of 'toy/two': it uses symbols from outside its point (stray); use only those of its point",
         ),
         (
             cost(lambda p: p.q, weight=None, lower=[1.0, 2.0, 3.0], upper=9.0),
-            "term 'x' of 'toy/two': lower = [1.0, 2.0, 3.0] does not fit its expression, which has 1 row",
+            "term 'x' of 'toy/two': lower = [1.0, 2.0, 3.0] does not fit its expression, which has 1 row; give one "
+            "number, or one per row",
         ),
         (
             cost(lambda p: p.q, weight=None, lower=2.0, upper=1.0),
             "term 'x' of 'toy/two': lower = 2.0 is above upper = 1.0",
         ),
-        (cost(lambda p: p.q, weight=None, upper="high"), "term 'x' of 'toy/two': upper = 'high' is no number"),
+        (cost(lambda p: p.q, weight=None, upper="high"), "term 'x' of 'toy/two': upper = 'high' is not a number"),
     ],
 )
 def test_own_terms_that_are_refused(term, sentence):
@@ -139,15 +143,17 @@ def test_names_that_are_refused():
         "term 'x': 'toy' has no phase 'three'; it has one, two, and 'toy' for terms that join them",
         changed, toy(), {"three": [x]},
     )  # fmt: skip
-    refused("term 'x' of 'toy/two': the name is taken; give it one of its own", changed, toy(), {"two": [x, x]})
-    refused("term 'x' of 'toy': it needs at = 'problem'", changed, toy(), {"toy": [x]})
+    refused("term 'x' of 'toy/two': another term has this name; choose another one", changed, toy(), {"two": [x, x]})
+    refused(
+        "term 'x' of 'toy': at = 'node', must be 'problem' for a term that joins phases", changed, toy(), {"toy": [x]}
+    )
     refused("an own term of 'toy/two' must be a Term, got 3", changed, toy(), {"two": [3]})
     refused("toy: 'end row' is a constraint and has no weight; switch it off instead",
             changed, toy(), weights={"end row": 1.0})  # fmt: skip
     with pytest.raises(InputError, match=re.escape("weight or switch 'jrk': the problem 'toy' has no such term; it")):
         changed(toy(), off=["jrk"])
     refused(
-        "term 'base forces' links the motion to one; it cannot be switched off",
+        "term 'base forces' ties the plan into one motion, as dynamics and links do; it cannot be switched off",
         changed, plane_problem(), off=["flat/base forces"],
     )  # fmt: skip
 
@@ -156,7 +162,7 @@ def test_symbols_of_another_phase_are_refused():
     seen = []
     first = cost(lambda p: seen.append(p.q) or p.q, "first")
     problem = changed(toy(), {"one": [first]})
-    with pytest.raises(InputError, match=r"^term 'x' of 'toy/two': it uses symbols that are not its point's \(x_"):
+    with pytest.raises(InputError, match=r"^term 'x' of 'toy/two': it uses symbols from outside its point \(x_"):
         changed(problem, {"two": [cost(lambda p: seen[0][0])]})
 
 
@@ -165,8 +171,8 @@ def test_no_number_at_the_start_is_refused_before_the_solve(expression):
     nlp = Nlp(changed(move(), {"go": [cost(expression)]}))
     for solver in (nlp, nlp.with_options({}, hold=0.1)):
         refused(
-            "term 'x' of 'move/go': no finite value or derivative at the start of the solve; keep its arguments where "
-            "it is defined, for instance x + 1e-6 under a root",
+            "term 'x' of 'move/go': no finite value or derivative at the start of the solve; keep the arguments of its "
+            "functions away from where they are singular, as in sqrt(x + 1e-6)",
             solver.solve, {"goal": 2.0}, flat_guess(),
         )  # fmt: skip
 
@@ -225,21 +231,31 @@ def test_names_of_stages_that_are_refused(bhr):
     refused("own terms of 'srmp/flat' must be a list of terms, got 3", jl.Planner, bhr, terms={"srmp/flat": 3})
     refused("an own term of 'srmp/flat' must be a Term, got 3", jl.Planner, bhr, terms={"srmp/flat": [3]})
     refused("off must be a list of names, got 'jerk'", jl.Planner, bhr, off="jerk")
-    refused("a weight or switch is named by a text, got 3", jl.Planner, bhr, off=[3])
+    refused("the name of a weight or switch must be a text, got 3", jl.Planner, bhr, off=[3])
 
 
 def test_settings_that_are_refused(bhr):
     with pytest.raises(InputError, match=r"^Limits has no 'torque'; it has torque_share, .* and \d+ more$"):
         jl.Planner(bhr, limits={"torque": 1.0})
-    refused("Limits: friction = 'ice' must be like 0.42", jl.Planner, bhr, limits={"friction": "ice"})
-    refused("Limits or a mapping of its fields is needed, got 3", jl.Planner, bhr, limits=3)
-    refused("SrmpSettings: toe_s = 0.1 must be like (0.12, 0.12)", jl.Planner, bhr, settings={"toe_s": 0.1})
+    refused(
+        "Limits: friction = 'ice' must be of the same kind as its default, 0.42",
+        jl.Planner,
+        bhr,
+        limits={"friction": "ice"},
+    )
+    refused("give a Limits or a mapping of its fields, got 3", jl.Planner, bhr, limits=3)
+    refused(
+        "SrmpSettings: toe_s = 0.1 must be of the same kind as its default, (0.12, 0.12)",
+        jl.Planner,
+        bhr,
+        settings={"toe_s": 0.1},
+    )
     refused("mesh: toe = 1 intervals, must be a whole number of 2 or more", jl.Planner, bhr, mesh={"toe": 1})
 
 
 def test_what_a_method_would_ignore_is_refused(bhr):
-    task, start = jl.JumpTask(0.4, 0.3), "the method 'direct' has no place for "
-    end = ": it takes limits, mesh and the terms of 'whole body'; choose 'three-step', or leave that out"
+    task, start = jl.JumpTask(0.4, 0.3), "method 'direct' cannot use changes of "
+    end = ": it takes limits, mesh and the terms of 'whole body'; choose 'three-step', or leave out these changes"
     for how, what in (
         (dict(terms={"srmp/flat": [calm()]}), "'srmp'"),
         (dict(off=["joint qp/friction"], weights={"srmp/turn": 1.0}), "'srmp' and 'joint qp'"),

@@ -172,12 +172,12 @@ def test_a_few_priced_steps_lead_to_a_robot_that_jumps_higher(highest, better, b
 @pytest.mark.parametrize(
     ("free", "sentence"),
     [
-        ({}, "give what may change as a mapping, of gear, thigh_m, shank_m, mass_kg"),
-        ({"gear": ["elbow"]}, "'elbow', which is none of the roles"),
-        ({"gear": {"knee": (2, 1)}}, "the ends of gear of knee must be positive and in order"),
+        ({}, "must be a mapping of what may change, from gear, thigh_m, shank_m, mass_kg"),
+        ({"gear": ["elbow"]}, "'elbow', which is neither a role"),
+        ({"gear": {"knee": (2, 1)}}, "the range of gear of knee must be positive and in order"),
         ({"gear": 3}, "give joints or roles"),
-        ({"thigh_m": (1, 2)}, "thigh is 0.35, outside of its ends 1 ... 2"),
-        ({"mass_kg": {"hat": (1, 2)}}, "there is no link 'hat'"),
+        ({"thigh_m": (1, 2)}, "thigh is 0.35 now, outside the given range 1 ... 2; widen it"),
+        ({"mass_kg": {"hat": (1, 2)}}, "cannot change the mass of 'hat': there is no such link"),
         ("gear", "free must be a mapping"),
     ],
 )

@@ -101,4 +101,7 @@ def test_of_another_robot():
     with pytest.raises(InputError) as e:
         planner().replan(replace(jump(1.0, 0.5), robot=stronger), JumpTask(0.9, 0.5))
     own = planner().robot.hash
-    assert str(e.value) == f"the previous plan is for the robot bhr ({stronger.hash}), not for bhr ({own})"
+    assert (
+        str(e.value)
+        == f"the previous plan is for the robot bhr ({stronger.hash}), not for bhr ({own}); give a plan of this robot"
+    )

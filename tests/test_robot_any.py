@@ -118,7 +118,7 @@ def test_a_stance_at_the_end_of_a_range_is_refused(tmp_path):
     (tmp_path / "s.toml").write_text(config("s").replace("shoulder_rad = 0.0", "shoulder_rad = 1.19"))
     assert refused(lambda: Robot.load(str(tmp_path / "s.toml"))) == (
         "robot s: standing, shoulder is at 1.190 rad, less than 0.04 from the end of its range -3 ... 1.2; no plan can "
-        "start there; with shoulder_rad = 0 in [stance] it can"
+        "start there; with shoulder_rad = 0 in [stance] the robot can stand"
     )
 
 
@@ -176,7 +176,7 @@ STONE = """<link name="stone"><inertial><mass value="2.5"/>
 
 REFUSED = [
     (GOOD.replace("</robot>", STONE), config("x"),
-     "my.urdf: 2.500 kg do not hang on the trunk ('stone'); they are joined to it by no joint of a robot"),
+     "my.urdf: 2.500 kg do not hang on the trunk ('stone'); connect them to it by joints of a robot, or remove them"),
     (GOOD, config("x", trunk="pelvis"),
      "my.urdf: the configuration names the link 'pelvis', which the URDF lacks"),
     (GOOD, config("x", forward="ahead"),

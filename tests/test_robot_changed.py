@@ -157,7 +157,7 @@ def test_a_published_robot_takes_the_same_changes():
     heavy = robot.with_mass(trunk, factor=1.25)
     assert heavy.total_mass - robot.total_mass == pytest.approx(0.25 * robot.model.inertias[1].mass)
     np.testing.assert_allclose(heavy.model.inertias[1].inertia, 1.25 * robot.model.inertias[1].inertia, rtol=1e-9)
-    with pytest.raises(RobotError, match=f"there is no link '{trunk}_rest' to weigh otherwise"):
+    with pytest.raises(RobotError, match=f"cannot change the mass of '{trunk}_rest': there is no such link"):
         robot.with_mass(f"{trunk}_rest", factor=2)
 
 
@@ -190,8 +190,8 @@ def test_gears_trade_torque_against_speed(bhr):
 
 
 # refused --------------------------------------------------------------------------------------------------------
-NOWHERE = "nor can it with knees at 0.3 ... 1.2 and the trunk at 0 ... 0.3 rad in [stance]: correct its ranges or its "
-NOWHERE += "soles"
+NOWHERE = "the robot cannot stand with knees at 0.3 ... 1.2 and the trunk at 0 ... 0.3 rad in [stance] either; "
+NOWHERE += "correct its ranges or its soles"
 REFUSED = [
     ("with_gears", {"ratios": {"knee": 0}}, "the factor on the gear of 'knee' must be a positive number, got 0"),
     ("with_gears", {"ratios": 2}, "the gears must be a mapping from joints or roles, got 2"),
@@ -201,22 +201,22 @@ REFUSED = [
     ("with_limits", {"effort": np.nan}, "the factor on effort must be a positive number, got nan"),
     ("with_limits", {"speed": "1"}, "the factor on speed must be a positive number, got '1'"),
     ("with_limits", {"speed": {"knee": True}}, "the factor on speed of 'knee' must be a positive number, got True"),
-    ("with_limits", {"effort": {"kneee": 2.0}}, "the factors on effort name 'kneee', which is none of the roles hip, "
-     f"knee, ankle, shoulder, or the joints {nearest(BHR.joint_names, 'kneee')}"),
+    ("with_limits", {"effort": {"kneee": 2.0}}, "the factors on effort name 'kneee', which is neither a role (hip, "
+     f"knee, ankle, shoulder) nor a joint ({nearest(BHR.joint_names, 'kneee')})"),
     ("with_limits", {"joints": [("knee", 2.0)]},
      "the ranges must be a mapping from joints or roles, got [('knee', 2.0)]"),
     ("with_limits", {"joints": {"knee": {"low": 0.1}}},
-     "the limits of 'knee' are lower, upper [rad], effort [N m], speed [rad/s], got {'low': 0.1}"),
+     "the limits of 'knee' must be a mapping of lower, upper [rad], effort [N m] or speed [rad/s], got {'low': 0.1}"),
     ("with_limits", {"joints": {"knee": {"upper": np.inf}}}, "upper of 'knee' [rad] must be a finite number, got inf"),
     ("with_limits", {"joints": {"knee": {"lower": 3.0}}}, "joint 'left_knee' has range 3 ... 2.4 rad, effort 210 N m, "
      "speed 20 rad/s; all must be finite, positive and in order"),
     ("with_limits", {"joints": {"left_knee": {"upper": 0.6}, "right_knee": {"lower": 0.7}}},
-     "no standing posture with the knees at 0.5 rad and the trunk at 0.05 rad has flat feet below the CoM, 21 mm or "
-     f"mrad are missing; {NOWHERE}"),
+     "with the knees at 0.5 rad and the trunk at 0.05 rad no posture stands on flat feet below the CoM: the nearest is "
+     f"21 mm or mrad off, at most 1; {NOWHERE}"),
     ("with_limits", {"joints": {"knee": {"upper": 0.4}}},
      "standing with the knee at 0.5 rad needs knee at 0.500 rad, outside its range 0 ... 0.4; "
-     "with knee_rad = 0.3 and trunk_pitch_rad = 0 in [stance] it can"),
-    ("with_mass", {"link": "trunk"}, "a mass is changed by mass_kg or by factor, give one of them"),
+     "with knee_rad = 0.3 and trunk_pitch_rad = 0 in [stance] the robot can stand"),
+    ("with_mass", {"link": "trunk"}, "give either mass_kg or factor to change a mass, and not both"),
     ("with_mass", {"link": "trunk", "mass_kg": -1}, "mass_kg of 'trunk' must be a positive number, got -1"),
     ("with_mass", {"link": "trunk", "factor": np.inf},
      "the factor on the mass of 'trunk' must be a positive number, got inf"),
@@ -233,14 +233,15 @@ def test_a_link_that_is_not_there(bhr, link):
     wrong = link[1] if isinstance(link, list | tuple) and link else link
     with pytest.raises(RobotError) as e:
         bhr.with_mass(link, factor=2.0)
-    sentence = f"robot bhr: there is no link {wrong!r} to weigh otherwise; it has "
+    sentence = f"robot bhr: cannot change the mass of {wrong!r}: there is no such link; it has "
     assert str(e.value).startswith(sentence)
 
 
 def test_arms_that_are_held_have_no_limits(tmp_path):
     robot = Robot.load(write(tmp_path, held_arms))
     assert refused(lambda: robot.with_limits(effort={"shoulder": 2.0})) == (
-        "robot held_arms: the factors on effort name 'shoulder', a role without joints: its arms are held"
+        "robot held_arms: the factors on effort name 'shoulder', but no joint has this role: the arms are held; "
+        "leave it out"
     )
 
 

@@ -431,7 +431,7 @@ def test_where_it_faces_by_several_signs_and_by_word(put):
     sideways = found.text.replace('# facing = "-x"', 'facing = "+y"')
     assert "'source.facing' = '+y' must be +x or -x" in refused(lambda: check(path, sideways))
     swapped = re.sub(r'\["(left_\w+)", "(right_\w+)"\]', r'["\2", "\1"]', found.text)
-    assert "is named as the left one, and is on the right" in refused(lambda: check(path, swapped))
+    assert "is named as the left one, but lies on the right" in refused(lambda: check(path, swapped))
 
 
 # masses, limits, words -----------------------------------------------------------------------------------------------
@@ -493,8 +493,8 @@ def test_what_is_advised_is_enough(put):
 
 
 @pytest.mark.parametrize(("line", "sentence"), [
-    ("[limts.knee]\neffort = 1.0", "robot configuration: [limts] is nothing that is read; did you mean limits?"),
-    ("[shapes]\ntigh_thickness_m = 0.1", "robot configuration: [shapes] 'tigh_thickness_m' is nothing that is read; "
+    ("[limts.knee]\neffort = 1.0", "robot configuration: [limts] is unknown; did you mean limits?"),
+    ("[shapes]\ntigh_thickness_m = 0.1", "robot configuration: [shapes] 'tigh_thickness_m' is unknown; "
                                          "did you mean thigh_thickness_m?"),
 ])  # fmt: skip
 def test_misspelt_tables_are_refused(put, line, sentence):

@@ -159,12 +159,9 @@ def test_joints_without_stops_get_a_range_that_is_told(tmp_path):
         "left_ankle_roll": {"velocity": 60.0},
     }
     assert set(found.roles.notes) == {
-        "joint 'left_knee': lower = 0, upper = 2.3 assumed, the URDF has none that can be meant; correct "
-        "[limits.left_knee]",
-        "joint 'right_knee': lower = -2.3, upper = 0 assumed, the URDF has none that can be meant; correct "
-        "[limits.right_knee]",
-        "joint 'left_ankle_roll': velocity = 60 assumed, the URDF has none that can be meant; correct "
-        "[limits.left_ankle_roll]",
+        "joint 'left_knee': lower = 0, upper = 2.3 assumed, the URDF has no usable ones; correct [limits.left_knee]",
+        "joint 'right_knee': lower = -2.3, upper = 0 assumed, the URDF has no usable ones; correct [limits.right_knee]",
+        "joint 'left_ankle_roll': velocity = 60 assumed, the URDF has no usable ones; correct [limits.left_ankle_roll]",
     }
     assert found.faults == () and check(path, found.text).robot.sagittal.upper[1] == 2.3
 

@@ -221,7 +221,7 @@ def test_a_shove_is_timed_by_the_plan_and_known_to_the_checks(bhr):
     assert [Push(3, 2, (0.0, 0.0, 0.0)).at(k) for k in range(2, 6)] == [False, True, True, False]
     with pytest.raises(InputError) as e:
         Perturbation(shoves=shoves).pushes(None)
-    assert str(e.value) == "a shove, and other ground for the landing, belong to one jump; leave them away in a chain"
+    assert str(e.value) == "a shove, and other ground for the landing, are for a single jump; leave them out of a chain"
 
 
 @pytest.mark.parametrize("name", INSTALLED)
@@ -255,8 +255,8 @@ def test_the_landing_is_moved_and_the_start_is_not(bhr):
     with pytest.raises(InputError) as e:
         Perturbation(ground_m=0.03).ground(Scene.flat(), bhr, short)
     assert str(e.value) == (
-        "the soles land 0.00 m from where they start, on the same ground, which cannot differ only for the landing; "
-        "jump farther, or leave ground_* away"
+        "the soles land 0.00 m from where they start, so ground_* would also change the ground of the start; "
+        "jump farther, or leave out ground_*"
     )
 
 

@@ -173,14 +173,14 @@ def test_where_it_has_no_effect_it_is_refused(bhr, tape, tmp_path):
     with pytest.raises(InputError) as refused:
         simulate_jump(tape, bhr, feedback=True, mode="pd")
     assert str(refused.value) == (
-        "feedback answers to all that is measured, and mode 'pd' would do so twice; "
+        "feedback cannot run in mode 'pd', where the servos already correct the same measured errors; "
         "choose mode 'position' or 'whole-body'"
     )
-    with pytest.raises(InputError, match=r"^feedback answers to all that is measured"):
+    with pytest.raises(InputError, match=r"^feedback cannot run in mode 'pd'"):
         TrialSettings("pd", feedback=True)
-    with pytest.raises(InputError, match="feedback acts in launch, and a run from the apex has none; leave one"):
+    with pytest.raises(InputError, match="feedback corrects the launch, but a run with a disturbance begins after it"):
         simulate_jump(tape, bhr, feedback=True, disturbance=WrongApex(pitch_rad=0.1))
-    with pytest.raises(InputError, match="feedback acts in launch, and the basin's states are those of a flight"):
+    with pytest.raises(InputError, match="feedback corrects the launch, but the basin's states begin in flight"):
         landing_basin(tmp_path, 1, TrialSettings(MODE, feedback=True))
 
 

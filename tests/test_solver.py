@@ -267,7 +267,7 @@ def test_too_few_iterations_is_not_an_answer():
 )
 def test_a_term_that_is_no_number_is_named(capfd, term, named):
     """Or whose slope is none; CasADi itself knows only row and column."""
-    with pytest.raises(SolverError, match="no finite value or slope at the initial guess has go/") as e:
+    with pytest.raises(SolverError, match=r"go/.* has no finite value or slope at the initial guess;") as e:
         Nlp(move(term)).solve({"goal": 1.0}, flat_guess())
     assert e.value.violations == named and e.value.status == "Invalid_Number_Detected"
     assert capfd.readouterr().err == ""

@@ -206,10 +206,14 @@ def test_feet_tell_where_a_robot_faces_whose_knees_turn_both_ways(tmp_path):
 def test_what_needs_five_links_is_refused(robot):
     with pytest.raises(InputError) as e:
         run_chain(Course.of([0.3, 0.3], 0.3), robot)
-    assert str(e.value) == "robot wide: chains wait in a crouch of five links, which do not describe it"
+    assert str(e.value) == (
+        "robot wide: a chain needs a planar model of five links, in whose crouch the robot waits; choose a robot that "
+        "has one"
+    )
     with pytest.raises(InputError) as e:
         jl.Planner(robot).plan(jl.JumpTask(0.3, 0.2), start=np.zeros(5))
-    said = "robot wide begins in its stance: five links do not describe it; drop start"
+    said = "robot wide: start has the angles of five links, which do not describe this robot; leave out start, and the "
+    said += "plan begins in the stance"
     assert str(e.value) == said
 
 
@@ -242,7 +246,7 @@ def test_what_cannot_hold_its_own_weight_is_refused_before_any_solve(robot):
         assert given.success and np.max(np.abs(weight[6:] - pushes[6:] @ given.x) / effort) >= share - 1e-9
     weak = robot.with_limits(effort=0.9 * share)
     with pytest.raises(
-        InfeasibleError, match=r"^robot wide cannot stand as it begins: .* a joint needs 1\.1 times its"
+        InfeasibleError, match=r"^robot wide cannot hold the posture in which it begins: .* needs 1\.1 times its"
     ):
         jl.Planner(weak).plan(jl.JumpTask(0.3, 0.2))
 

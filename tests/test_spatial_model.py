@@ -192,7 +192,7 @@ def test_joints_that_turn_for_ever_are_refused():
     model.name = "cart"
     with pytest.raises(RobotError) as e:
         SpatialModel(model)
-    assert str(e.value) == "robot cart: joint 'wheel' is no joint that turns in a range"
+    assert str(e.value) == "robot cart: joint 'wheel' must be revolute and have a range"
 
 
 def test_free_base_is_needed():
@@ -201,7 +201,7 @@ def test_free_base_is_needed():
     model.name = "arm"
     with pytest.raises(RobotError) as e:
         SpatialModel(model)
-    assert str(e.value) == "robot arm: the spatial model takes a free base and joints of one axis each"
+    assert str(e.value) == "robot arm: the spatial model needs a free base and joints of one degree of freedom each"
 
 
 # even motions -----------------------------------------------------------------------------------------------------

@@ -407,8 +407,8 @@ def test_names_that_do_not_exist_are_refused():
 def test_platforms_that_would_lie_under_a_sole_are_refused():
     with pytest.raises(InfeasibleError) as e:
         planner().plan(replace(SIDE, platform_m=0.2), "direct")
-    said = "platform = 0.2 m at a distance of 0.3 m: the two surfaces would meet under a sole of bhr; that takes "
-    assert str(e.value) == said + "a distance of at least 0.35 m"
+    said = "platform = 0.2 m at a distance of 0.3 m: the two surfaces would meet under a sole of bhr; the "
+    assert str(e.value) == said + "distance must be at least 0.35 m"
     surface_of_jump(Body(jl.Robot.load()), Limits(), replace(SIDE, side_m=0.35, platform_m=0.2))
 
 

@@ -90,7 +90,7 @@ def test_touchdown_above_the_apex():
     with pytest.raises(InputError) as e:
         JumpTask(1.0, 0.5).flight_time(0.52)
     assert str(e.value) == (
-        "a CoM rise of 0.5 m cannot reach a touchdown 0.520 m above take-off; it takes at least that height"
+        "a CoM rise of 0.5 m cannot reach a touchdown 0.520 m above take-off; the rise must be at least that"
     )
     with pytest.raises(InputError):
         JumpTask(1.0, 0.5).flight_time(math.nan)

@@ -240,7 +240,7 @@ def test_what_a_cad_leaves_over_is_a_note():
     text = text.replace(f'ixx="{ixx:g}"', f'ixx="{ixx + 0.006:.6g}"')
     notes = list(urdf_checks.notes(urdf_checks.read_tree(text, FILE)))
     assert notes[:2] == [
-        "the call <sensors> of a xacro macro is left over, and passed over",
+        "the call <sensors> of a xacro macro is left over, and ignored",
         "link 'trunk': a sphere of radius 0 is taken as a point",
     ]
     assert [note.split(",")[0] for note in notes[2:]] == [

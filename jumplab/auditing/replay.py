@@ -241,7 +241,9 @@ def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Mode
                 f"tape: the contact frame {name!r} is not a link of the robot {robot.name!r}"
             )
     if not frames:
-        raise InputError("tape: it names no contact frame; a jump needs at least one foot")
+        raise InputError(
+            "tape: it names no contact frame, but a jump needs a foot; plan the jump again"
+        )
     return model, [model.getFrameId(name, pin.FrameType.BODY) for name in frames]
 
 

@@ -34,7 +34,9 @@ def run(args: Namespace) -> None:
     for pair in args.parameter:
         name, text = named("--parameter must be NAME=VALUE", pair)
         if name in values:
-            raise InputError(f"--parameter {name} is given twice, or has an option of its own")
+            raise InputError(
+                f"--parameter {name} is given twice, or has an option of its own; set it once"
+            )
         try:
             values[name] = ast.literal_eval(text)
         except (ValueError, SyntaxError, MemoryError, RecursionError):
@@ -60,7 +62,7 @@ def plan(args: Namespace) -> None:
     start = time.perf_counter()
     task = JumpTask(**given(JumpTask, args))
     if args.contacts:
-        why = "is part of a target, and --contacts gives a schedule instead"
+        why = "cannot be used with --contacts, which gives a schedule instead of a target"
         without(args, why, **{f.name: f.default for f in fields(JumpTask)[2:]})
         without(args, why, distance_m=1.0, height_m=0.5, like=None)
         without(args, why, robust=False, atlas=None, starts=1)
@@ -70,7 +72,7 @@ def plan(args: Namespace) -> None:
     if args.robust:
         ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     else:
-        without(args, "says what --robust allows for, which is not given", disturb=[])
+        without(args, "has an effect only with --robust, which is not given", disturb=[])
     options = given(jl.plan, args, task=task, robust=ranges, atlas=atlas)
     with warnings.catch_warnings(action="ignore"):  # the audit is told below
         plan = jl.plan(**options)
@@ -109,7 +111,7 @@ def simulate(args: Namespace) -> None:
     ranges = sim.ranges_of(sizes)
     drawn = None
     if not sizes:
-        without(args, "says where --disturb acts, which is not given", seed=None)
+        without(args, "has an effect only with --disturb, which is not given", seed=None)
     tape, robot, summary = io.folder.read_plan(args.dir)
     io.folder.ensure_writable(args.dir)
     if sizes:
@@ -126,7 +128,7 @@ def simulate(args: Namespace) -> None:
 def view(args: Namespace) -> None:
     """Show a jump in 3-D, as one HTML file, or make an animation of it."""
     if args.movie:
-        without(args, "names the page, and --movie is given instead of it", out=None)
+        without(args, "names the page, but --movie makes an animation instead", out=None)
     tape, robot, summary = io.folder.read_plan(args.dir)
     path = Path(args.movie or args.out or Path(args.dir, "jump.html"))
     io.folder.ensure_writable(path.parent)

@@ -224,7 +224,8 @@ def _checked(values: dict[str, Any], declared: Iterable[Kinds]) -> dict[str, Any
     for name, value in values.items():
         if name in ("out", "figures"):
             raise InputError(
-                f"the parameter {name!r} is set by the runner; use its own argument {name}"
+                f"the runner sets the notebook parameter {name!r} itself; pass the folder as its "
+                f"argument {name}"
             )
         if name not in known:
             raise InputError(

@@ -46,9 +46,7 @@ def check(args: Namespace) -> None:
 
     urdf, draft = args.urdf, None
     if (urdf is None) == (args.robot_description is None):
-        raise InputError(
-            "jumplab robot check: name a URDF, or a robot by --robot-description; one of the two"
-        )
+        raise InputError("jumplab robot check: give either a URDF or --robot-description")
     if urdf is None:
         urdf = str(described(args.robot_description))
         print(f"robot description: {urdf}")
@@ -80,8 +78,7 @@ def check(args: Namespace) -> None:
         result = checkup.examine(urdf)
     else:
         raise InputError(
-            f"{urdf!r} is the default robot, described as jumplab needs it; there is nothing to "
-            f"check"
+            f"{urdf!r} is the default robot, and its description needs no check; give another robot"
         )
     robot = result.robot
     picture = jl.plots.robot_sheet(robot) if args.out else None

@@ -33,11 +33,9 @@ ASKED = {"foot_distance_m": "distance_m", "com_rise_m": "height_m"}  # metrics b
 def trials(args: Namespace) -> None:
     """Play a plan on many perturbed robots."""
     if args.basin:
-        why = "is for robots that are drawn, and --basin draws none"
+        why = "is for perturbed robots, but --basin uses the robot as planned"
         without(args, why, seed=None, disturb=[], keep_falls=0)
-        without(
-            args, "acts in launch, and the basin's states are those of a flight", feedback=False
-        )
+        without(args, "corrects the launch, but --basin begins in flight", feedback=False)
     ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
     options = {"folder": args.dir, "settings": _settings(args, noise=noise, ranges=ranges)}
@@ -88,7 +86,10 @@ def certify(args: Namespace) -> None:
         print(f"{mode.mode} mode")
         print(jl.plots.table(mode.differences, studies.certify.COLUMNS, digits=3))
         landed = ", ".join(f"{count} in {name}" for name, count in mode.landed.items())
-        print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
+        print(
+            f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} have the same "
+            f"outcome"
+        )
     for engine, trial in certificate.usual.items():
         print(f"usual contact, {engine}: {trial.reason}")
     print(
@@ -122,11 +123,11 @@ def clips(args: Namespace) -> None:
 def chain(args: Namespace) -> None:
     """Simulate several jumps in a row, each planned while the one before lands."""
     if args.runs == 1:
-        without(args, "is for several --runs", jobs=None)
+        without(args, "has an effect only with several --runs", jobs=None)
         if args.seed is None:
             without(
                 args,
-                "says how perturbed robots differ, and neither --seed nor --runs asks for one",
+                "is for perturbed robots, but neither --seed nor --runs asks for one",
                 ranges=None,
             )
     axes = (args.distance_m, args.height_m, args.platform_m, args.side_m, args.yaw_rad)
@@ -192,7 +193,7 @@ def _print_chain(result: Any, series: dict[str, Any] | None) -> None:
 def envelope(args: Namespace) -> None:
     """Map the jumps that a robot can do."""
     if args.side_m is not None and args.yaw_rad is not None:
-        raise InputError("--side-m and --yaw-deg are two maps; leave one of them out")
+        raise InputError("--side-m and --yaw-deg ask for two different maps; leave one of them out")
     if args.side_m is not None and len(args.height_m) != 1:
         raise InputError(
             f"a map of sides has one height, got {len(args.height_m)}; give --height-m one number"
@@ -201,7 +202,9 @@ def envelope(args: Namespace) -> None:
     fixed = JumpTask(0.0, args.height_m[0]) if axes[0] == "side_m" else None
     across, up = (getattr(args, name) for name in axes)
     if axes in MAPS:
-        without(args, "holds jumps straight ahead", atlas=None)
+        without(
+            args, "holds jumps straight ahead, but this map goes to the side or turns", atlas=None
+        )
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
     options = {"distances": across, "heights": up, "axes": axes, "fixed": fixed}
     options |= {"folder": args.out, "atlas": atlas}
@@ -284,7 +287,7 @@ def sweep(args: Namespace) -> None:
     if args.cluster:
         without(
             args,
-            "is for processes of this machine, and --cluster does the work elsewhere",
+            "sets processes of this machine, but --cluster does the work elsewhere",
             jobs=None,
         )
     axes = (args.distance_m, args.height_m, args.platform_m)

@@ -82,8 +82,8 @@ def check_mode(mode: str) -> None:
     """Refuse (:class:`InputError`) a mode of playback in which the launch cannot be corrected."""
     if mode == "pd":
         raise InputError(
-            "feedback answers to all that is measured, and mode 'pd' would do so twice; "
-            "choose mode 'position' or 'whole-body'"
+            "feedback cannot run in mode 'pd', where the servos already correct the same measured "
+            "errors; choose mode 'position' or 'whole-body'"
         )
 
 

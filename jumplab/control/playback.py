@@ -59,7 +59,8 @@ class Playback:
         names = tuple(map(str, tape.joint_names))
         if names != robot.joint_names:
             raise InputError(
-                f"the tape's joints {', '.join(names[:3])} ... are not those of robot {robot.name}"
+                f"the tape's joints {', '.join(names[:3])} ... are not those of robot "
+                f"{robot.name}; plan the jump again with this robot"
             )
         self.steps = round(float(tape.t[-1]) / STEP_S)
         self.lead = round(lead_s / STEP_S)

@@ -307,8 +307,8 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
         notes.append(f"{rate:g} frames per second {'as given' if fps else 'assumed'}")
     elif fps is not None and abs(fps - raw.fps) > 0.01 * raw.fps:
         raise InputError(
-            f"{where}: has {raw.fps:g} frames per second by itself, and fps = {fps:g} is given; "
-            f"leave fps away"
+            f"{where}: states {raw.fps:g} frames per second, but fps = {fps:g} is given; "
+            f"leave out fps"
         )
     _check_numbers(where, raw)
     _check_axes(where, raw)
@@ -344,12 +344,15 @@ def _check_numbers(where: str, raw: _Raw) -> None:
     bad = np.argwhere(~np.isfinite(whole))
     if len(bad):
         frame, column = bad[0]
-        raise InputError(f"{where}: frame {frame}, column {column} is no finite number; repair it")
+        raise InputError(
+            f"{where}: frame {frame}, column {column} is not a finite number; repair it"
+        )
     length = np.linalg.norm(raw.turn, axis=1)
     if np.abs(length - 1).max() > 0.01:
         frame = int(np.abs(length - 1).argmax())
         raise InputError(
-            f"{where}: the quaternion of frame {frame} has length {length[frame]:.3g}, not 1"
+            f"{where}: the quaternion of frame {frame} has length {length[frame]:.3g}, must be 1; "
+            "normalise it"
         )
     most = np.abs(raw.joints).max()
     if most > TURN_RAD:
@@ -377,8 +380,8 @@ def _check_axes(where: str, raw: _Raw) -> None:
         )
     if upright(_first_wxyz(raw.turn)) > 0.9:
         raise InputError(
-            f"{where}: the robot lies or stands on its head, but not if its quaternions are "
-            f"w x y z; pass x y z w"
+            f"{where}: its quaternions, read as x y z w, lay the robot down or stand it on its "
+            f"head; read as w x y z they keep it upright: reorder them to x y z w"
         )
 
 
@@ -451,5 +454,8 @@ def _check_joints(where: str, robot: Robot, q: np.ndarray, unnamed: bool, order:
         names = [ordered(robot.urdf, x)[0] for x in (order, other)]
         joints = q[:, [7 + names[1].index(name) for name in names[0]]]
         if beyond(joints).max() < BEYOND_RAD:
-            raise InputError(f"{words}, but none in {other} order; pass order = {other!r}")
-    raise InputError(f"{words}: another order of joints, or another robot's clip")
+            raise InputError(f"{words}, but no joint is in {other} order; pass order = {other!r}")
+    raise InputError(
+        f"{words}: its joints are in another order, or the clip is of another robot; correct "
+        "the order, or pass that robot"
+    )

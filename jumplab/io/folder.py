@@ -204,7 +204,8 @@ def write_simulation(folder: str | Path, result: Any, summary: Summary) -> None:
     """
     if not {"planned_distance_m", "planned_rise_m", "manifest"} <= set(summary):
         raise InputError(
-            "the summary is not one that a plan was read with; take it from store.read_plan"
+            "the summary of the plan is incomplete; pass the one that "
+            "jumplab.io.folder.read_plan returns"
         )
     planned = {name: summary[name] for name in ("planned_distance_m", "planned_rise_m")}
     with _beside(folder, summary) as staging:

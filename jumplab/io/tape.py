@@ -147,6 +147,6 @@ class Tape(Shown):
             )
         for name in _DIMENSIONS:
             if name not in data:
-                raise InputError(f"{path}: the array {name!r} is missing")
+                raise InputError(f"{path}: the array {name!r} is missing; plan the jump again")
         own = {name: data.pop(name) for name in _DIMENSIONS}
         return cls(**own, extra=data)

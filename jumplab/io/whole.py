@@ -178,8 +178,8 @@ class Whole:
         gaps = np.linalg.norm(np.subtract(*both), axis=1)
         if gaps.max() > APART_M:
             raise InputError(
-                f"robot {self.robot.name}: joint {names[gaps.argmax()]!r} is "
-                f"{1e3 * gaps.max():.0f} mm off the published robot's, at most "
+                f"robot {self.robot.name}: joint {names[gaps.argmax()]!r} lies "
+                f"{1e3 * gaps.max():.0f} mm from its place in the published robot, at most "
                 f"{1e3 * APART_M:.0f}; import the changed robot's own URDF"
             )
 

@@ -77,8 +77,8 @@ class SpatialModel:
             or model.nv - 6 != model.njoints - 2
         ):
             raise RobotError(
-                f"robot {model.name}: the spatial model takes a free base and joints of one axis "
-                f"each"
+                f"robot {model.name}: the spatial model needs a free base and joints of one degree "
+                f"of freedom each"
             )
         data = model.createData()
         pin.computeJointJacobians(model, data, pin.neutral(model))
@@ -126,7 +126,7 @@ class SpatialModel:
             or np.abs(way[:3]).max() > 1e-9
         ):
             raise RobotError(
-                f"robot {model.name}: joint {model.names[j]!r} is no joint that turns in a range"
+                f"robot {model.name}: joint {model.names[j]!r} must be revolute and have a range"
             )
         return _frame_along(way[3:])
 

@@ -66,7 +66,8 @@ def changed(
     for owner, term in problem.terms():
         if term.identity and is_named(owner, term, off):
             raise InputError(
-                f"term {term.name!r} links the motion to one; it cannot be switched off"
+                f"term {term.name!r} ties the plan into one motion, as dynamics and links do; it "
+                f"cannot be switched off"
             )
 
     def kept(owner: str, items: tuple) -> tuple:
@@ -106,11 +107,13 @@ def _with(problem: Problem, owner: str, term: Term, look: Callable) -> Problem:
             f"{', '.join(names)}, and {problem.name!r} for terms that join them"
         )
     if joining and term.at != "problem":
-        raise InputError(f"{who}: it needs at = 'problem'")
+        raise InputError(f"{who}: at = {term.at!r}, must be 'problem' for a term that joins phases")
     if term.at == "problem" and not joining:
-        raise InputError(f"{who}: at = 'problem' belongs to {problem.name!r} itself")
+        raise InputError(
+            f"{who}: at = 'problem' joins phases; add the term to {problem.name!r} instead"
+        )
     if term.name in {JERK_CHAIN, *(x.name for o, x in problem.items() if o == owner)}:
-        raise InputError(f"{who}: the name is taken; give it one of its own")
+        raise InputError(f"{who}: another term has this name; choose another one")
     if "/" in term.name:
         raise InputError(f"{who}: a name must not hold a '/'")
     if term.is_cost:
@@ -131,7 +134,9 @@ def _digest(problem: Problem, owner: str, term: Term, who: str) -> str:
     made = ca.Function("own", [f.local, f.data, f.parameters], columns, {"allow_free": True})
     if made.has_free():
         free = ", ".join(made.get_free()[:3])
-        raise InputError(f"{who}: it uses symbols that are not its point's ({free})")
+        raise InputError(
+            f"{who}: it uses symbols from outside its point ({free}); use only those of its point"
+        )
     # bounds that are functions are read when solving
     if not (term.is_cost or callable(term.lower) or callable(term.upper)):
         ends(who, term, columns[0].numel())
@@ -149,11 +154,12 @@ def ends(who: str, term: Term, rows: int) -> tuple[np.ndarray, np.ndarray]:
         try:
             value = np.asarray(bound, float).ravel()
         except (TypeError, ValueError):
-            raise InputError(f"{who}: {side} = {quoted(bound)} is no number") from None
+            raise InputError(f"{who}: {side} = {quoted(bound)} is not a number") from None
         if value.size not in (1, rows) or np.any(np.isnan(value)):
             count = f"{rows} row{'s' * (rows > 1)}"
             raise InputError(
-                f"{who}: {side} = {quoted(bound)} does not fit its expression, which has {count}"
+                f"{who}: {side} = {quoted(bound)} does not fit its expression, which has {count}; "
+                "give one number, or one per row"
             )
         values.append(np.broadcast_to(value, (rows,)))
     low, high = values

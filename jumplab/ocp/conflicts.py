@@ -29,8 +29,8 @@ def reasons(
         if lost:
             named = " or ".join(lost[:NAMED])
             return (
-                f": no finite value or slope at the {where} has {named}; keep its arguments where "
-                "it is defined, or start from another guess",
+                f": {named} has no finite value or slope at the {where}; keep the arguments "
+                "of the term where it is defined, or start from another guess",
                 lost,
             )
     if not explain:
@@ -63,8 +63,8 @@ def check_start(a: Assembled, posed: Posed) -> None:
     if own:
         who = " or ".join(f"{name!r} of {a.problem.place(owner)!r}" for owner, name in own)
         raise InputError(
-            f"term {who}: no finite value or derivative at the start of the solve; keep its "
-            "arguments where it is defined, for instance x + 1e-6 under a root"
+            f"term {who}: no finite value or derivative at the start of the solve; keep the "
+            "arguments of its functions away from where they are singular, as in sqrt(x + 1e-6)"
         )
 
 

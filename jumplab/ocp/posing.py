@@ -68,7 +68,7 @@ def _data(a: Assembled, parameters, references, weights) -> np.ndarray:
     unknown = set(parameters) ^ set(problem.parameters)
     if unknown:
         raise InputError(
-            f"{problem.name}: parameters {sorted(unknown)} do not fit; it takes "
+            f"{problem.name}: parameters {sorted(unknown)} are missing or unknown; it takes "
             f"{list(problem.parameters)}"
         )
     values = []
@@ -106,8 +106,8 @@ def _node_data(layout: PhaseLayout, given: Mapping, where: str) -> np.ndarray:
     odd = sorted(set(given) ^ set(known))
     if odd:
         raise InputError(
-            f"{where}: references {odd} of phase {layout.phase.name!r} do not fit; it takes "
-            f"{list(known)}"
+            f"{where}: references {odd} of phase {layout.phase.name!r} are missing or unknown; "
+            f"it takes {list(known)}"
         )
     rows = [np.linspace(0, 1, count)[None]]
     for ref, size in known.items():
@@ -176,7 +176,7 @@ def _tighten(
         raise InputError(
             f"bound {bound.name!r} of phase {layout.phase.name!r} and another on {bound.on!r} "
             f"exclude each other at node {node}, component {i}: {low[index[k, i]]:.4g} > "
-            f"{high[index[k, i]]:.4g} (scaled); look at those that depend on the target"
+            f"{high[index[k, i]]:.4g} (scaled); check the bounds that depend on the target"
         )
 
 

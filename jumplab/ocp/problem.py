@@ -137,8 +137,8 @@ class Term:
             raise InputError(f"term {self.name!r}: skip must be a tuple, got {quoted(self.skip)}")
         if self.skip != (0, 0) and (self.is_cost or self.at != "node"):
             raise InputError(
-                f"term {self.name!r}: skip is for constraints at 'node'; a cost at {self.at!r} has "
-                "no use of it"
+                f"term {self.name!r}: skip = {self.skip} is only for constraints at 'node', not "
+                f"for a {'cost' if self.is_cost else 'constraint'} at {self.at!r}; leave out skip"
             )
         if not isinstance(self.at, str) or self.at not in PLACES:
             raise InputError(

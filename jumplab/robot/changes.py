@@ -52,8 +52,8 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
         asked = ranges[key]
         if not (isinstance(asked, Mapping) and asked and set(asked) <= set(UNITS)):
             raise robot.error(
-                f"the limits of {key!r} are lower, upper [rad], effort [N m], speed [rad/s], got "
-                f"{quoted(asked)}"
+                f"the limits of {key!r} must be a mapping of lower, upper [rad], effort [N m] or "
+                f"speed [rad/s], got {quoted(asked)}"
             )
         for end, value in asked.items():
             what = f"{end} of {key!r} [{UNITS[end]}]"
@@ -84,7 +84,7 @@ def masses(
     Raises :class:`RobotError` as :meth:`.Robot.with_mass` says.
     """
     if (mass_kg is None) == (factor is None):
-        raise robot.error("a mass is changed by mass_kg or by factor, give one of them")
+        raise robot.error("give either mass_kg or factor to change a mass, and not both")
     root = _parsed(robot)
     remarks = []
     bodies = _bodies(root)
@@ -98,7 +98,7 @@ def masses(
     for link in names:
         if not isinstance(link, str) or link not in bodies:
             raise robot.error(
-                f"there is no link {quoted(link)} to weigh otherwise; it has "
+                f"cannot change the mass of {quoted(link)}: there is no such link; it has "
                 f"{nearest(bodies, link)}"
             )
     for link in dict.fromkeys(names):
@@ -200,11 +200,13 @@ def _joints(robot: Robot, given: Mapping, where: str) -> list[tuple[str, Sequenc
             pairs.append((key, (key,)))
         elif key not in roles:
             raise robot.error(
-                f"{where} name {quoted(key)}, which is none of the roles "
-                f"{', '.join(SAGITTAL_JOINTS)}, or the joints {nearest(robot.joint_names, key)}"
+                f"{where} name {quoted(key)}, which is neither a role "
+                f"({', '.join(SAGITTAL_JOINTS)}) nor a joint ({nearest(robot.joint_names, key)})"
             )
         elif not robot.joints[roles[key]]:
-            raise robot.error(f"{where} name {key!r}, a role without joints: its arms are held")
+            raise robot.error(
+                f"{where} name {key!r}, but no joint has this role: the arms are held; leave it out"
+            )
         else:
             pairs.insert(0, (key, robot.joints[roles[key]]))
     return pairs

@@ -183,15 +183,15 @@ class Robot(Shown):
             most = max(1.0, self.motors["no_load_ratios"].get(name, 1.0))
             if not (self._model.existJointName(name) and 0 < ratio < most):
                 raise self.error(
-                    f"corner_speed_ratios: {name} = {ratio:g} must be of a "
-                    f"joint, and between 0 and {most:g}"
+                    f"corner_speed_ratios: {name} = {ratio:g} must name a joint, and lie "
+                    f"between 0 and {most:g}"
                 )
         for key, least in MOTORS.items():  # no motor gives less than nothing at the speed limit
             for name, value in self.motors[key].items() if least is not None else ():
                 if name not in self.joint_names or value < least:
                     raise self.error(
-                        f"{key}: {name} = {value:g} must be of a joint that "
-                        f"moves, and at least {least:g}"
+                        f"{key}: {name} = {value:g} must name a joint that moves, and be at "
+                        f"least {least:g}"
                     )
         for name in self.foot.frames:
             if not self._model.existFrame(name, pin.FrameType.BODY):

@@ -167,7 +167,8 @@ def read_toml(text: str, where: str) -> dict:
     """The file as nested tables; :class:`RobotError` (with the name ``where``) if it is none."""
     if NESTED.search(text):
         raise RobotError(
-            f"{where}: a key of more than {DEEPEST} parts between dots; is it a robot?"
+            f"{where}: a key has more than {DEEPEST} parts between dots; give the TOML file of a "
+            f"robot"
         )
     try:
         return tomllib.loads(text)
@@ -216,10 +217,8 @@ def check_entries(config: dict, known: Mapping[str, tuple[str, ...] | None]) -> 
 def _check_name(name: str, known: Collection[str], where: str, shown: str) -> None:
     if name not in known:
         near = get_close_matches(name, known, 1)
-        hint = f"did you mean {near[0]}?" if near else f"it may hold {', '.join(known)}"
-        raise RobotError(
-            f"robot configuration: {where}{shown.format(name)} is nothing that is read; {hint}"
-        )
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(known)}"
+        raise RobotError(f"robot configuration: {where}{shown.format(name)} is unknown; {hint}")
 
 
 def table(config: dict, name: str) -> dict:

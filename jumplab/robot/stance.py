@@ -103,11 +103,12 @@ def _other_stance(robot: Robot) -> str:
         except RobotError:
             continue
         values = " and ".join(f"{key} = {angle:g}" for key, angle in other.items())
-        return f"with {values} in [stance] it can"
+        return f"with {values} in [stance] the robot can stand"
     knees, trunks = zip(*OTHER_STANCES, strict=True)
     return (
-        f"nor can it with knees at {min(knees):g} ... {max(knees):g} and the trunk at "
-        f"{min(trunks):g} ... {max(trunks):g} rad in [stance]: correct its ranges or its soles"
+        f"the robot cannot stand with knees at {min(knees):g} ... {max(knees):g} and the trunk at "
+        f"{min(trunks):g} ... {max(trunks):g} rad in [stance] either; correct its ranges or its "
+        f"soles"
     )
 
 
@@ -253,9 +254,9 @@ def standing(robot: Robot) -> np.ndarray:
     worst = np.abs(missing(solved.x)[:-1]).max()
     if worst > STANDS_M:
         raise robot.error(
-            f"no standing posture with the knees at {knee:g} rad and the trunk "
-            f"at {trunk:g} rad has flat feet below the CoM, {1e3 * worst:.0f} mm or mrad are "
-            f"missing; {CHANGE_STANCE}"
+            f"with the knees at {knee:g} rad and the trunk at {trunk:g} rad no posture stands on "
+            f"flat feet below the CoM: the nearest is {1e3 * worst:.0f} mm or mrad off, at most "
+            f"{1e3 * STANDS_M:g}; {CHANGE_STANCE}"
         )
     return q
 

@@ -105,7 +105,7 @@ def notes(tree: Tree) -> Iterator[str]:
     for element in tree.xml:
         if "xacro" in element.tag:
             name = element.tag.rpartition("}")[2]
-            yield f"the call <{name}> of a xacro macro is left over, and passed over"
+            yield f"the call <{name}> of a xacro macro is left over, and ignored"
     yield from (note.get("text") for note in tree.xml.findall("note"))
     for name, link in tree.elements.items():
         if any(numbers(x.get("radius"), 1) == 0 for x in link.findall("collision/geometry/sphere")):
@@ -142,7 +142,7 @@ def _losses(moving: list[Joint]) -> Iterator[str]:
             if key in OWN and finite(told, (key,)).get(key, -1.0) < 0:
                 wrong.setdefault((key, text), []).append(joint.name)
     for (key, text), joints in wrong.items():
-        yield f"{key} = {text!r} of {listed(joints)} must be a number from 0 on: not used"
+        yield f"{key} = {text!r} of {listed(joints)} must be a number of 0 or more: not used"
     used = Counter(key for joint in moving for key in joint.losses)
     if used:
         counts = ", ".join(f"{key} of {used[key]} joints" for key in OWN if used[key])
@@ -168,7 +168,10 @@ def _structure_faults(root: ET.Element, where: str) -> list[str]:
     if not joints:
         return [f"{where}: has {len(links)} links and no <joint>; nothing can move"]
     if len(links) > MOST_LINKS:
-        return [f"{where}: has {len(links)} links, a humanoid at most {MOST_LINKS}; is it one?"]
+        return [
+            f"{where}: has {len(links)} links, a humanoid at most {MOST_LINKS}; give the file of "
+            f"one"
+        ]
     doubtful = []
     for kind, elements in (("link", links), ("joint", joints)):
         for name, times in Counter(e.get("name") for e in elements).items():

@@ -95,7 +95,7 @@ def check(path: str | Path, config_text: str, tree: Tree | None = None) -> Check
     path = Path(path)
     config = read_toml(config_text, "robot configuration")
     if "source" not in config:
-        missing = "the table [source] is missing: it names trunk, forward, up and repair"
+        missing = "the table [source] is missing; add it, with trunk, forward, up and repair"
         raise RobotError(f"robot configuration: {missing}")
     repair = source_of(config)["repair"]
     tree = tree or urdf_checks.read_tree(read_urdf(path), path.name, path, repair)
@@ -116,8 +116,8 @@ def check_texts(urdf: str, config_text: str, where: str = "") -> None:
     for name, link in tree.elements.items():
         for mesh in link.iterfind("*/geometry/mesh"):
             raise tree.error(
-                f"link {name!r}: the mesh {quoted(mesh.get('filename'))} is not opened; make it a "
-                f"box, or describe the robot by a TOML with [source]"
+                f"link {name!r}: the mesh {quoted(mesh.get('filename'))} is not opened without "
+                f"[source]; make it a box, or describe the robot by a TOML file with [source]"
             )
     for pair in roles_table(read_toml(config_text, "robot configuration")).values():
         for name in pair if where else ():

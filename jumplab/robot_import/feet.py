@@ -55,7 +55,7 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
         x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
         files = [shape.get("filename") for x in tree.below(foot) for _, shape in tree.shapes(x)]
         lost = listed(sorted({*filter(None, files)}))
-        source = "GUESSED from the leg's length: the foot has no shape that is at hand"
+        source = "GUESSED from the leg's length: no shape of the foot could be read"
         source += f", the mesh {lost} is not there" if lost else ""
         return Sole(x, y, leg_m * GUESS_Z, source)
     source = f"from its {' and '.join(sorted(kinds))}"
@@ -96,9 +96,9 @@ def _refuse_lean(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> None:
     by = best * np.sign(cosines[ankle])
     raise tree.error(
         f"with all joints at 0 the foot {foot!r} stands on its {'toes' if best < 0 else 'heel'}, "
-        f"{abs(np.degrees(best)):.0f} deg from level, and jumps are planned from a level one; let "
-        f"joint {ankle.name!r} count from there: turn its frame by {by:.3g} rad about its axis, "
-        f"and shift its range by {-by:.3g}"
+        f"{abs(np.degrees(best)):.0f} deg from level, but it must be level; move the zero of joint "
+        f"{ankle.name!r}: turn its frame by {by:.3g} rad about its axis, and shift its range by "
+        f"{-by:.3g}"
     )
 
 

@@ -127,8 +127,8 @@ def _facing(config: dict) -> dict:
     other = forward.translate(str.maketrans("+-", "-+"))
     if facing != other:
         raise RobotError(
-            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, one "
-            f"of both ways along which it can walk"
+            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, the "
+            f"two directions in which it can walk"
         )
     new = copy.deepcopy(config)
     new["source"]["forward"] = facing
@@ -156,7 +156,7 @@ def _sole(tree: Tree, config: dict, offset: np.ndarray) -> dict[str, float]:
         raise tree.error(
             f"the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
             f"must lie below it and reach to both sides of it: the foot stands on its heel or its "
-            f"toes with all joints at 0, or [feet] is wrong; give there the sole along the level "
+            f"toes with all joints at 0, or [feet] is wrong; give the sole in [feet] along level "
             f"axes"
         )
     return {"heel": float(x[0]), "toe": float(x[1]), "half": float(half), "z": float(z)}
@@ -337,8 +337,8 @@ def _given_boxes(config: dict, links: set[str]) -> dict[str, Boxes]:
         ends = np.reshape(entry(config, "shapes", "boxes_m", name, count=6), (3, 2))
         if name not in links or np.any(ends[:, 0] >= ends[:, 1]):
             raise RobotError(
-                f"robot configuration: 'shapes.boxes_m.{name}' must be of a link that moves, each "
-                f"first number below the second"
+                f"robot configuration: 'shapes.boxes_m.{name}' must name a link that moves, with "
+                f"the first number of each pair below the second"
             )
         out[name] = [_box(ends)]
     return out

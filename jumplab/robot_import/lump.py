@@ -114,8 +114,8 @@ def lump(
     if hips[0][1] <= hips[1][1]:
         left, right = roles["hip_pitch"]
         raise tree.error(
-            f"joint {left!r} is named as the left one, and is on the right of {right!r} where the "
-            f"trunk faces {source['forward']}; give [source] facing, which turns all pairs, or "
+            f"joint {left!r} is named as the left one, but lies on the right of {right!r} where "
+            f"the trunk faces {source['forward']}; turn all pairs round by [source] facing, or "
             f"correct [joints]"
         )
     middle = np.array([0.0, (hips[0][1] + hips[1][1]) / 2, 0.0])
@@ -343,8 +343,8 @@ def _bodies(
     if abs(missing) > 1e-9 * tree.mass:
         lost = sorted(carriers.keys() - links)
         raise tree.error(
-            f"{missing:.3f} kg do not hang on the trunk ({listed(lost)}); they are joined to it by "
-            f"no joint of a robot"
+            f"{missing:.3f} kg do not hang on the trunk ({listed(lost)}); connect them to it by "
+            f"joints of a robot, or remove them"
         )
     return bodies, links
 

@@ -345,8 +345,8 @@ def find_roles(tree: Tree) -> Roles:
     for name, limits in assumed.items():
         values = ", ".join(f"{part} = {value:g}" for part, value in limits.items())
         notes.append(
-            f"joint {name!r}: {values} assumed, the {tree.format} has none that can be meant; "
-            f"correct [limits.{key(name)}]"
+            f"joint {name!r}: {values} assumed, the {tree.format} has no usable ones; correct "
+            f"[limits.{key(name)}]"
         )
     return Roles(trunk, ahead, above, joints, feet, assumed, tuple(notes))
 

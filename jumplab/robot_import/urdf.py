@@ -183,7 +183,7 @@ def parse(text: str, where: str) -> ET.Element:
         what = ROOTS.get(root.tag, "a URDF begins with <robot>")
         raise RobotError(f"{where}: the root element is <{root.tag}>, {what}")
     if late:
-        words = "the XML declaration stands behind a comment or a space, and is passed over"
+        words = "the XML declaration stands behind a comment or a space, and is ignored"
         ET.SubElement(root, "note", text=words)
     return root
 

@@ -325,5 +325,5 @@ class Plots:
 
     def _planned(self) -> JumpPlan:
         if not isinstance(self._of, JumpPlan):
-            raise InputError("this picture is of a plan; .strobe() shows any jump")
+            raise InputError("this figure needs a plan; use .strobe(), which shows any jump")
         return self._of

@@ -147,11 +147,15 @@ def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Sce
             raise InputError("a movie of a robot needs its record, a tape or a simulation")
         return of, record, scene or Scene.flat()
     if record is not None:
-        raise InputError("a movie of a plan or a simulation takes no other record; leave it out")
+        raise InputError(
+            "a movie of a plan or a simulation takes no other record; leave out record"
+        )
     if isinstance(of, JumpPlan):
         return of.robot, of.tape, scene or Scene.of_plan(of.summary, of.robot)
     if of.robot is None:
-        raise InputError("the robot of this simulation is not known; give it, then the simulation")
+        raise InputError(
+            "the robot of this simulation is unknown; pass the robot, and then the simulation"
+        )
     return of.robot, of, scene or ground_of(of)
 
 

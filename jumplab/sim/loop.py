@@ -199,7 +199,8 @@ def simulate_jump(
     _check(tape, stand_s)
     if control.get("feedback") and disturbance is not None:
         raise InputError(
-            "feedback acts in launch, and a run from the apex has none; leave one of them away"
+            "feedback corrects the launch, but a run with a disturbance begins after it, at the "
+            "apex; leave out feedback or disturbance"
         )
     run = Run(robot, perturbation, scene, engine, tape, contact)
     ground = run.scene.seen_along(Gauge(robot).heading(tape.q[-1]), robot, tape.q[-1]).top_at

@@ -364,8 +364,8 @@ class Perturbation:
 def _of_one_jump(tape: Tape | None) -> Tape:
     if tape is None:
         raise InputError(
-            "a shove, and other ground for the landing, belong to one jump; "
-            "leave them away in a chain"
+            "a shove, and other ground for the landing, are for a single jump; "
+            "leave them out of a chain"
         )
     return tape
 
@@ -405,7 +405,8 @@ def _trunk_box(robot: Robot, payload_kg: float) -> tuple[np.ndarray, np.ndarray]
             corners += [shape.placement.act(np.array(end)) for end in ends]
     if not corners:
         raise InputError(
-            f"robot {robot.name}: its trunk has no shape to carry a payload_kg; leave that away"
+            f"robot {robot.name}: its trunk has no collision shape to carry payload_kg = "
+            f"{payload_kg:g}; leave out payload_kg"
         )
     return np.min(corners, axis=0), np.max(corners, axis=0)
 

@@ -127,7 +127,9 @@ class Scene:
             # soles' middle at x = 0
             edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])
         except (KeyError, TypeError) as e:
-            raise InputError(f"the summary is none of a plan ({e})") from None
+            raise InputError(
+                f"the summary is not that of a plan ({e}); plan the jump again"
+            ) from None
         return cls.level("platform", {edge: top}, along_rad)
 
     @classmethod
@@ -257,8 +259,8 @@ class Scene:
         gap = min(last) - max(first)
         if gap < GAP_M:
             raise InputError(
-                f"the soles land {np.hypot(*way):.2f} m from where they start, on the same ground, "
-                "which cannot differ only for the landing; jump farther, or leave ground_* away"
+                f"the soles land {np.hypot(*way):.2f} m from where they start, so ground_* would "
+                f"also change the ground of the start; jump farther, or leave out ground_*"
             )
         edge = max(first) + gap / 2
         blocks = [replace(b, x_to=min(b.x_to, edge)) for b in scene.blocks if b.x_from < edge]

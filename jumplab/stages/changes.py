@@ -139,7 +139,7 @@ def _stage_and_phase(name: Any) -> tuple[str, str]:
 def _stage_of(name: Any) -> tuple[str, str]:
     """(stage, rest of the name); stage and phase in lower case."""
     if not isinstance(name, str):
-        raise InputError(f"a weight or switch is named by a text, got {quoted(name)}")
+        raise InputError(f"the name of a weight or switch must be a text, got {quoted(name)}")
     first, _, rest = name.partition("/")
     stage, rest = (first.lower(), rest) if first.lower() in PHASES else (LAST, name)
     phase, slash, term = rest.partition("/")
@@ -173,9 +173,7 @@ def named(kind: type[Settings], given: Settings | Mapping[str, Any] | None) -> d
         given = {n: getattr(given, n) for n in names if getattr(given, n) != getattr(usual, n)}
     given = {} if given is None else given
     if not isinstance(given, Mapping):
-        raise InputError(
-            f"{kind.__name__} or a mapping of its fields is needed, got {quoted(given)}"
-        )
+        raise InputError(f"give a {kind.__name__} or a mapping of its fields, got {quoted(given)}")
     for name, value in given.items():
         if name not in names:
             raise InputError(
@@ -183,7 +181,8 @@ def named(kind: type[Settings], given: Settings | Mapping[str, Any] | None) -> d
             )
         if _sort(value) not in [_sort(getattr(x, name)) for x in (usual, usual.of_flip())]:
             raise InputError(
-                f"{kind.__name__}: {name} = {quoted(value)} must be like {getattr(usual, name)!r}"
+                f"{kind.__name__}: {name} = {quoted(value)} must be of the same kind as its "
+                f"default, {getattr(usual, name)!r}"
             )
     return dict(given)
 

@@ -230,13 +230,13 @@ class Planner(Shown):
             method = METHODS[0 if following or self._of_first_stages(asked) else 1]
         if method != "direct" and self.atlas is not None:
             raise InputError(
-                f"method {quoted(method)}: an atlas holds direct plans; choose 'direct', or leave "
-                f"it away"
+                f"method {quoted(method)}: an atlas holds direct plans only; choose 'direct', or "
+                f"leave out the atlas"
             )
         if method != "direct" and not self.robot.planar:
             raise InputError(
-                f"method {quoted(method)}: no plane describes robot {self.robot.name}; choose "
-                f"'direct'"
+                f"method {quoted(method)}: it needs a planar model, which robot {self.robot.name} "
+                f"does not have; choose 'direct'"
             )
         return method
 
@@ -261,15 +261,17 @@ class Planner(Shown):
         if self.chosen(method, weights) == "direct":
             if ignored := self._of_first_stages(asked):
                 raise InputError(
-                    f"the method 'direct' has no place for {' and '.join(ignored)}: it takes "
+                    f"method 'direct' cannot use changes of {' and '.join(ignored)}: it takes "
                     f"limits, mesh and the terms of 'whole body'; choose 'three-step', or leave "
-                    f"that out"
+                    f"out these changes"
                 )
             asked[LAST].applied(self.program(task, asked[LAST].weights).nlp.problem)
             return asked
         flip = bool(task.rotation_rad)
         if flip and self._joint_changes(asked["joint qp"]):
-            raise InputError("flips have no stage 2; leave out all that is changed of 'joint qp'")
+            raise InputError(
+                "a flip is planned without stage 2; leave out all changes of 'joint qp'"
+            )
         for name in ("srmp", LAST):
             asked[name].applied(self.stage(name, flip=flip).nlp.problem)
         if not flip:
@@ -291,12 +293,12 @@ class Planner(Shown):
             )
         if start is not None and not self.robot.planar:
             raise InputError(
-                f"robot {self.robot.name} begins in its stance: five links do not describe it; "
-                f"drop start"
+                f"robot {self.robot.name}: start has the angles of five links, which do not "
+                f"describe this robot; leave out start, and the plan begins in the stance"
             )
         if start is not None and task.rotation_rad:
             raise InputError(
-                "a flip begins in the stance; leave its start away, or ask for no rotation"
+                "a flip begins in the stance; leave out start, or set rotation_rad to 0"
             )
         limits = self._settings(Limits, bool(task.rotation_rad))
         surface_of_jump(self._model, limits, task)
@@ -343,12 +345,12 @@ class Planner(Shown):
         self._check(task, method, start)
         if not (starts == 1 or (1 < starts <= len(COMPARED) and near is None)):
             raise InputError(
-                f"starts = {starts} must be 1 to {len(COMPARED)}, and 1 near another plan"
+                f"starts = {starts} must be 1 to {len(COMPARED)}, and 1 if near is given"
             )
         if starts > 1 and (method != "direct" or task.rotation_rad):
             raise InputError(
-                "several starts are compared by the method 'direct', in jumps without rotation; "
-                "leave starts away"
+                f"starts = {starts}: only method 'direct' compares several starts, and only in "
+                f"jumps without rotation; leave out starts"
             )
         asked = self.prepared(method, weights, task)
         begin = {"weights": asked[LAST].weights}
@@ -409,7 +411,8 @@ class Planner(Shown):
         if previous.robot.hash != self.robot.hash:
             raise InputError(
                 f"the previous plan is for the robot {previous.robot.name} "
-                f"({previous.robot.hash}), not for {self.robot.name} ({self.robot.hash})"
+                f"({previous.robot.hash}), not for {self.robot.name} ({self.robot.hash}); "
+                f"give a plan of this robot"
             )
         anew = task.rotation_rad or previous.contacts is not None or previous.whole_body is None
         near = None if anew else previous
@@ -446,7 +449,8 @@ class Planner(Shown):
         """
         if contacts.ends != "rest":
             raise InputError(
-                "a schedule that ends at touchdown is a standing jump; ask for it by its target"
+                "a schedule that ends at touchdown is a standing jump; plan it by its target, "
+                "JumpTask(...), instead"
             )
         asked = sorted_out(weights=weights)[LAST]
         # a schedule has its own places; of a target only gravity and rise are taken

@@ -19,7 +19,7 @@ import numpy as np
 
 from jumplab import reading
 from jumplab.arguments import checked
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, SolverError, quoted
 from jumplab.io.files import locked, made, write_file
 from jumplab.ocp.cache import fingerprint
 from jumplab.ocp.derivatives import parts
@@ -119,8 +119,8 @@ class Atlas:
             path = str(Path(folder) / FILE)
             if there.key != atlas.key:
                 raise InputError(
-                    f"{path!r} is of robot {there.robot} with other limits, terms or mesh, not of "
-                    f"this {robot.name}; choose another folder"
+                    f"{path!r} holds an atlas of robot {there.robot} that does not fit "
+                    f"{robot.name}: robot, limits, terms or mesh differ; choose another folder"
                 )
             if (there.distances, there.heights) != (atlas.distances, atlas.heights):
                 raise InputError(
@@ -170,8 +170,9 @@ class Atlas:
         """
         if key_of_plans(body) != self.key:
             raise InputError(
-                f"the atlas is of robot {self.robot} with other limits, terms or mesh than this "
-                f"planner of {body.robot.name}; build one for it, or leave the atlas away"
+                f"the atlas of robot {self.robot} does not fit this planner of "
+                f"{body.robot.name}: robot, limits, terms or mesh differ; build an atlas for "
+                f"this planner, or leave it out"
             )
 
     def solve(
@@ -234,7 +235,7 @@ class Atlas:
             head = json.loads(str(file["head"]))
             rows = file["rows"]
             if head["format"] != FORMAT or not np.all(np.isfinite(rows)):
-                raise ValueError("other format, or numbers that are none")
+                raise ValueError("unknown format, or numbers that are not finite")
             nodes = [Node(*node, x) for node, x in zip(head["nodes"], rows, strict=True)]
             places = {(node.distance_m, node.height_m): node for node in nodes}
             return cls(head["robot"], head["distances"], head["heights"], places, head["key"])
@@ -263,7 +264,8 @@ def _axis(name: str, values: Sequence[float]) -> tuple[float, ...]:
     values = tuple(round(float(x), 9) for x in values)
     if not values or list(values) != sorted(set(values)):
         raise InputError(
-            f"the {name} of an atlas must be rising, at least one; got {len(values)} values"
+            f"the {name} of an atlas must be one or more numbers in rising order, got "
+            f"{quoted(values)}"
         )
     return values
 

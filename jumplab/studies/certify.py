@@ -150,18 +150,18 @@ class ModeReport:
                 sentences.append(f"{q.name} was not measured in every engine")
             elif not row["within"]:
                 sentences.append(
-                    f"the engines are {q.with_unit(row['apart'])} apart in {q.name}, at most "
-                    f"{q.with_unit(row['limit'])}"
+                    f"the engines differ by {q.with_unit(row['apart'])} in {q.name} (limit "
+                    f"{q.with_unit(row['limit'])})"
                 )
             if (row["median"] or 0.0) > row["limit"]:
                 sentences.append(
-                    f"perturbed robots are {q.with_unit(row['median'])} apart in {q.name} "
-                    f"(median), at most {row['limit']:.3g}"
+                    f"for perturbed robots the engines differ by {q.with_unit(row['median'])} in "
+                    f"{q.name} (median, limit {q.with_unit(row['limit'])})"
                 )
         if self.same < LIMITS["verdict_share"] * len(self.pairs):
             sentences.append(
-                f"{self.same} of {len(self.pairs)} perturbed robots fare alike, at least "
-                f"{100 * LIMITS['verdict_share']:g} % are asked for"
+                f"{self.same} of {len(self.pairs)} perturbed robots have the same outcome in every "
+                f"engine, must be at least {100 * LIMITS['verdict_share']:g} %"
             )
         return [f"{self.mode} mode: {sentence}" for sentence in sentences]
 

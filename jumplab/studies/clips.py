@@ -99,7 +99,7 @@ def make_clips(
     tasks = targets(robot)
     unknown = [name for name in only or () if name not in tasks]
     if unknown:
-        raise InputError(f"there is no clip {unknown[0]!r}; choose of {', '.join(tasks)}")
+        raise InputError(f"there is no clip {unknown[0]!r}; choose from {', '.join(tasks)}")
     for engine in ENGINES:
         engine_class(engine)
     out = store.ensure_writable(out)

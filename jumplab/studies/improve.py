@@ -173,7 +173,7 @@ def _numbers(robot: Robot, free: Mapping[str, Any]) -> Free:
     kinds = ("gear", *PARTS, "mass_kg")
     if not free or set(free) - set(kinds):
         raise InputError(
-            f"free = {quoted(free)}: give what may change as a mapping, of {', '.join(kinds)}"
+            f"free = {quoted(free)}: must be a mapping of what may change, from {', '.join(kinds)}"
         )
     out = {}
     for kind, given in free.items():
@@ -193,7 +193,10 @@ def _numbers(robot: Robot, free: Mapping[str, Any]) -> Free:
             low, high = _ends(word, ends)
             size = sizes[key]
             if not low <= size <= high:
-                raise InputError(f"{word} is {size:.4g}, outside of its ends {low:g} ... {high:g}")
+                raise InputError(
+                    f"{word} is {size:.4g} now, outside the given range {low:g} ... {high:g}; "
+                    f"widen it"
+                )
             unit = "" if kind == "gear" else kind.rpartition("_")[2]
             out[kind, key] = Change(word, unit, low, high, size, size, 0.0)
     _changed(robot, out, np.full(len(out), 1 + 1e-6))  # refuses names that the robot lacks
@@ -202,14 +205,16 @@ def _numbers(robot: Robot, free: Mapping[str, Any]) -> Free:
 
 def _listed(given: Any) -> list:
     if not isinstance(given, str | list | tuple) or not given:
-        raise InputError(f"gear = {quoted(given)}: give joints or roles, or (low, high) of each")
+        raise InputError(
+            f"gear = {quoted(given)}: give joints or roles, or a mapping of them to (low, high)"
+        )
     return [given] if isinstance(given, str) else list(given)
 
 
 def _ends(word: str, ends: Any) -> tuple[float, float]:
-    low, high = fitting(ends, tuple[float, float], f"the ends of {word}")
+    low, high = fitting(ends, tuple[float, float], f"the range of {word}")
     if not 0 < low < high:
-        raise InputError(f"the ends of {word} must be positive and in order, got {quoted(ends)}")
+        raise InputError(f"the range of {word} must be positive and in order, got {quoted(ends)}")
     return low, high
 
 

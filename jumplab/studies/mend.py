@@ -152,14 +152,14 @@ def mend(
         except SolverError:
             continue
         raise InfeasibleError(
-            f"clip {before.clip.name!r} cannot be mended: {refusal}; {factor:g} of its way, turn "
-            f"and height can",
+            f"clip {before.clip.name!r} cannot be mended: {refusal}; it can with {factor:g} of its "
+            f"travel, turn and height",
             number="factor",
             bound=factor,
         ) from refusal
     raise InfeasibleError(
-        f"clip {before.clip.name!r} cannot be mended: {refusal}; nor can {FACTORS[-1]:g} of its "
-        f"way, turn and height"
+        f"clip {before.clip.name!r} cannot be mended: {refusal}; nor can it with {FACTORS[-1]:g} "
+        f"of its travel, turn and height"
     ) from refusal
 
 
@@ -186,7 +186,10 @@ def like(
         If the clip or the target is not of that sort, or there is no such motion.
     """
     if task.platform_m or task.rotation_rad:
-        raise InputError("a jump like a clip is one on level ground that does not turn over")
+        raise InputError(
+            "a jump like a clip needs level ground and no flip; set platform_m and rotation_rad "
+            "to 0"
+        )
     before = _judged(motion, robot, fps, order)
     draft = Draft(before, goal=task)
     return Planner(before.clip.robot, keep=True, **changes).follow(
@@ -333,8 +336,8 @@ class Draft:
         k = feet.index(FLIGHT) if FLIGHT in feet else 0
         if feet.count(FLIGHT) != 1 or feet[k - 1] != "lr" or feet[k + 1] != "LR":
             raise InputError(
-                f"clip {self.clip.name!r}: its feet carry as {' '.join(feet)}; a jump to a target "
-                f"is like one that flies once, off both feet and down on both"
+                f"clip {self.clip.name!r}: its contacts are {' '.join(feet)}; a jump to a target "
+                f"needs a clip that flies once, takes off from both feet and lands on both"
             )
         stood, middle = (self.middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
         turn = goal.yaw_rad - (middle[2] - stood[2])
@@ -486,8 +489,9 @@ class Draft:
                 chart[2] -= LOWER_M
         if left > BEGUN_OFF:
             raise InfeasibleError(
-                f"clip {self.clip.name!r} cannot be mended: where it begins, both legs at the ends "
-                f"of their ranges leave a sole {left:.2f} rad or m off flat on its place; the feet "
+                f"clip {self.clip.name!r} cannot be mended: at its start no posture within the "
+                f"joints' ranges puts both soles flat in their places, {left:.2f} rad or m are "
+                f"left, at most {BEGUN_OFF:g}; the feet "
                 f"are {np.linalg.norm(self.holds[0][0][:2] - self.holds[0][1][:2]):.2f} m apart"
             )
         return chart

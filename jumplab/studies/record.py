@@ -221,7 +221,7 @@ def record(
         raise InputError(f"share = {share:g} must be above 0 and at most 1")
     for engine in engines:
         if engine not in ENGINES:
-            raise InputError(f"engine {quoted(engine)}: choose of {', '.join(ENGINES)}, or none")
+            raise InputError(f"engine {quoted(engine)}: choose from {', '.join(ENGINES)}, or none")
     changes = dict(terms=terms, weights=weights, off=off, limits=limits, mesh=mesh)
     planner = Planner(robot, keep=True, **changes)
     with unexplained():
@@ -299,7 +299,7 @@ class _Search:
     def refuse_end(self, task: JumpTask, solved: Solved) -> None:
         """Refuse a record that a number of the problem ends, not the robot."""
         least, longest = self.stage.limits.flight_s
-        who = f"robot {self.planner.robot.name}: the record of {self.what} is ended by"
+        who = f"robot {self.planner.robot.name}: the record of {self.what} is limited by"
         if solved.solution.phases["flight"].duration > (1 - NEAR_END) * longest:
             raise InfeasibleError(
                 f"{who} the flight of {longest:g} s, the longest that plans may have, not by the "
@@ -312,7 +312,7 @@ class _Search:
             if getattr(task, name) > high - NEAR_END * (high - low):
                 raise InfeasibleError(
                     f"{who} {name} = {high:g} {unit_of(name)}, the largest that a target may have, "
-                    f"not by the robot; give it lower limits, or hold more of the target",
+                    f"not by the robot; give the robot lower limits, or fix more of the target",
                     number=name,
                     bound=high,
                 )

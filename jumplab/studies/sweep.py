@@ -175,7 +175,7 @@ def run(
     """
     if atlas and any(case.method != "direct" for case in cases):
         raise InputError(
-            "an atlas holds direct plans: choose the method 'direct', or leave it away"
+            "an atlas holds direct plans only; choose the method 'direct', or leave out the atlas"
         )
     if tapes_hz is not None and not 1 <= tapes_hz <= 1000:
         raise InputError(f"tapes_hz = {tapes_hz:g} Hz is outside 1 ... 1000 Hz")

@@ -136,7 +136,7 @@ def landing_basin(
     if count > len(states):
         raise InputError(f"n = {count} is too large; the basin has {len(states)} states")
     if settings.feedback:
-        raise InputError("feedback acts in launch, and the basin's states are those of a flight; leave it away")
+        raise InputError("feedback corrects the launch, but the basin's states begin in flight; leave out feedback")
     plan = PlanOnFile.read(folder)
     known = replace(settings, ranges=Ranges()).hash
     work = {}

@@ -215,7 +215,7 @@ def judge(name: str, measured: str, values: Mapping[str, float] | None = None, c
         If there is no such claim, the text is empty, or the values are not those of the limits.
     """
     if name not in CLAIMS:
-        raise InputError(f"there is no claim {quoted(name)}; choose of {', '.join(CLAIMS)}")
+        raise InputError(f"there is no claim {quoted(name)}; choose from {', '.join(CLAIMS)}")
     if not (isinstance(measured, str) and measured.strip()):
         raise InputError(f"measured of a claim must be a text, got {quoted(measured)}; say what was measured")
     claim, values = CLAIMS[name], values or {}

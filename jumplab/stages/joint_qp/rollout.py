@@ -133,7 +133,10 @@ class JointMapper:
     ):
         require_type(srmp, SrmpPlan, "stage 1's plan")
         if srmp.task.rotation_rad:
-            raise InputError("stage 2 follows no flip; by three steps stage 3 begins without it")
+            raise InputError(
+                f"stage 2 cannot follow a flip (rotation_rad = {srmp.task.rotation_rad:.3g}, must "
+                "be 0); plan flips by jumplab.plan(..., method='three-step'), which skips stage 2"
+            )
         parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else (step_s,) * 3
         for step in parts:
             if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):

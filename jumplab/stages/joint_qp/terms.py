@@ -256,8 +256,8 @@ def _look(term: Term, who: str, p: StepPoint) -> None:
     """Refuse a term that has no place in a step's QP."""
     if term.at != "node" or term.skip != (0, 0):
         raise InputError(
-            f"{who}: at = {term.at!r}, skip = {term.skip}; every step has its own QP, "
-            f"with at = 'node' and no skip"
+            f"{who}: at = {term.at!r}, skip = {term.skip}, must be 'node' and (0, 0), since every "
+            f"step has its own QP"
         )
     rows = rows_of(term, who, p)
     if not term.is_cost:

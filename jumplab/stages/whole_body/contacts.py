@@ -210,8 +210,8 @@ class Contacts:
         if any(heights[:first]) or set(heights[first:]) - {height}:
             listed = ", ".join(f"{up:g}" for up in heights)
             raise InputError(
-                f"places at the heights {listed} m: the ground has one step up or down; "
-                f"give all places after it the same up_m, and all before it none"
+                f"places at the heights {listed} m: the ground can have only one step up or down; "
+                f"give all places after the step the same up_m, and all before it none"
             )
         return height, first
 

@@ -88,8 +88,7 @@ def surface_of_jump(body: Body, limits: Limits, task: JumpTask) -> Surface:
         least = float(np.ceil(100 * (way - apart) - 1e-6) / 100)
         raise InfeasibleError(
             f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would "
-            f"meet under a sole of {body.robot.name}; that takes a distance of at least "
-            f"{least:.2f} m",
+            f"meet under a sole of {body.robot.name}; the distance must be at least {least:.2f} m",
             number="distance_m",
             bound=least,
         )
@@ -113,8 +112,8 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts) -> Surfa
         bound = leaving + room + length - toes
         raise InfeasibleError(
             f"places on a surface {height:g} m higher: it would begin {arriving - leaving:.2f} m "
-            f"ahead of the toes that leave, which takes {room:.2f} m; put the places {bound:.2f} m "
-            f"ahead",
+            f"ahead of the toes that take off, must be at least {room:.2f} m; put the places "
+            f"{bound:.2f} m ahead",
             number="ahead_m",
             bound=bound,
         )

@@ -316,10 +316,10 @@ class WholeBodyPlanner:
         if share > 1:
             effort = self.robot.actuators[joint]["effort"]
             raise InfeasibleError(
-                f"robot {self.robot.name} cannot stand as it begins: however the ground's forces "
-                f"are shared, a joint needs {share:.1f} times its effort, {joint} {torque:.3g} N m "
-                f"of {effort:.3g}; if these are motors' efforts before their gears, give those of "
-                f"the joints in [limits]"
+                f"robot {self.robot.name} cannot hold the posture in which it begins: however the "
+                f"ground's forces are shared, joint {joint} needs {share:.1f} times its effort, "
+                f"{torque:.3g} N m of {effort:.3g}; if these are motors' efforts before their "
+                f"gears, give those of the joints in [limits]"
             )
 
 

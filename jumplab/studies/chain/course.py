@@ -98,8 +98,7 @@ class Course:
                 raise InputError(f"{len(values)} {name} for {count} distances: give one per jump")
         if any(rows["platforms"]) and any([*rows["sides"], *rows["turns"]]):
             raise InputError(
-                "platforms lie on a straight way: leave them away, "
-                "or ask for neither sides nor turns"
+                "platforms need a straight course; leave out the platforms, or the sides and turns"
             )
         # above the surface that each jump starts from
         rows["platforms"] = np.diff(rows["platforms"], prepend=0.0).round(9).tolist()

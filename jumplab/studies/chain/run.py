@@ -123,7 +123,8 @@ def _jumps(run: Run, chain: ChainPilot, course: Course) -> tuple[ChainedJump, ..
 def _check(robot: Robot, landing: str, times_s: Mapping[str, float]) -> None:
     if not robot.planar:
         raise InputError(
-            f"robot {robot.name}: chains wait in a crouch of five links, which do not describe it"
+            f"robot {robot.name}: a chain needs a planar model of five links, in whose crouch the "
+            "robot waits; choose a robot that has one"
         )
     if landing not in LANDINGS:
         raise InputError(f"landing {quoted(landing)}: choose one of {', '.join(LANDINGS)}")
