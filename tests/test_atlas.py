@@ -171,7 +171,7 @@ def test_files_of_something_else_are_refused(tmp_path):
     with pytest.raises(InputError) as e:
         Atlas.build(Robot.load(), DISTANCES, (0.3, 0.4), folder=tmp_path)
     assert str(e.value) == f"{str(path)!r} has another grid of distances and heights; choose another folder"
-    with pytest.raises(InputError, match=r"with other limits, terms or mesh, not of this bhr; choose another folder$"):
+    with pytest.raises(InputError, match=r"not fit bhr: robot, limits, terms or mesh differ; choose another folder$"):
         Atlas.build(Robot.load(), DISTANCES, HEIGHTS, folder=tmp_path, limits={"torque_share": 0.8})
 
 

@@ -157,7 +157,7 @@ def test_a_pickle_with_code_is_refused_and_not_run(content, dump, tmp_path, monk
 
 WRONG = {
     "degrees": (dict(dof=np.degrees(Q[:, 7:])), "they look like degrees: pass radians"),
-    "w first": (dict(root_rot=np.roll(Q[:, 3:7], 1, axis=1)), "but not if its quaternions are w x y z; pass x y z w"),
+    "w first": (dict(root_rot=np.roll(Q[:, 3:7], 1, axis=1)), "upright: reorder them to x y z w"),
     "y up": (
         dict(
             root_trans_offset=Q[:, [0, 2, 1]],
@@ -165,7 +165,7 @@ WRONG = {
         ),
         "the robot's up is the world's y; turn the clip so that z points up",
     ),
-    "nan": (dict(dof=np.where(np.arange(len(Q))[:, None] == 7, np.nan, Q[:, 7:])), "frame 7, column 7 is no finite"),
+    "nan": (dict(dof=np.where(np.arange(len(Q))[:, None] == 7, np.nan, Q[:, 7:])), "frame 7, column 7 is not a finite"),
     "few": (dict(root_trans_offset=Q[:3, :3], root_rot=Q[:3, 3:7], dof=Q[:3, 7:]), "has 3 frames; a motion has 10"),
     "count": (dict(dof=Q[:, 7:-1]), "clips of robot bhr have 14: pass the robot that the clip was made for"),
     "lengths": (dict(dof=Q[:5, 7:]), r"must be \(n, 3\), \(n, 4\), \(n, joints\)"),

@@ -285,6 +285,6 @@ def test_terms_can_be_added_and_must_have_their_own_name():
 
 
 def test_skip_is_for_constraints_at_nodes():
-    sentence = "term 'x': skip = (1, 1) is only for constraints at 'node', not for a cost at 'node'; leave out skip"
+    sentence = "term 'x': skip = (2, 3) is only for constraints at 'node', not for a cost at 'node'; leave out skip"
     with pytest.raises(InputError, match=re.escape(sentence)):
         Term("x", "-", "m", "node", lambda p: p.q[0], weight=1.0, skip=(2, 3))

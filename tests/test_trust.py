@@ -95,7 +95,7 @@ def hostile(folder, robot):
         "deep.urdf": ("<robot>" + "<link>" * 60_000 + "</link>" * 60_000 + "</robot>", "has 120002 XML tags"),
         "long.urdf": ("<robot name='x'>" + "<link name='a'/>" * 1100 + "<joint/></robot>", "has 1100 links"),
         "deep.toml": ("a = " + "[" * 100_000, "not a TOML file"),
-        "keys.toml": (".".join("a" * 20_000) + " = 1", "a key of more than 100 parts"),
+        "keys.toml": (".".join("a" * 20_000) + " = 1", "a key has more than 100 parts"),
         "copies.xml": (MJCF.format("", COPIES.format(10**9)), "<replicate> makes 1e+09 copies"),
         "field.xml": (MJCF.format(field, ""), "<hfield> makes 9e+08"),
         "pipe.xml": (MJCF.format('<include file="pipe.urdf"/>', ""), "is a pipe or a device"),
