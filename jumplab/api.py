@@ -119,7 +119,7 @@ def plan(
         planner = Planner(robot, keep=True, **changes)
         made = plan_or_advise(planner, task, method, patience_s, starts)
     if not made.audit.sound:
-        warnings.warn(f"the plan is returned with its faults: {made.verdict}", stacklevel=3)
+        warnings.warn(f"the plan is returned although it has faults: {made.verdict}", stacklevel=3)
     return made
 
 

@@ -181,7 +181,7 @@ def test_footholds_are_one_unknown_in_all_phases_of_a_contact(bhr):
 
 # refused ------------------------------------------------------------------------------------------
 WRITE = "write L and R for flat feet, l and r for toes, left before right, or '-' for flight"
-WAIT = "a schedule begins on flat feet, at rest; there is no support to wait on"
+WAIT = "a schedule must begin at rest on flat feet, where the robot can wait; begin with 'LR'"
 ALONE = "the schedule begins on one foot without a place for the"
 AFTER = "a foot lands only after it has left the ground"
 STEP = "the ground can have only one step up or down; "
@@ -223,7 +223,7 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
         ),
         (
             lambda: schedule("LR L L LR", 1),
-            "phase '3 L': the same feet carry as in the phase before; make one phase of them",
+            "phase '3 L': the same feet are on the ground as in the phase before; make one phase of them",
         ),
         (lambda: schedule("lr - LR", 2), f"phase '1 lr': {WAIT}"),
         (lambda: schedule("Lr - LR", 2), f"phase '1 Lr': {WAIT}"),

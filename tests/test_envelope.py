@@ -102,7 +102,7 @@ def test_a_folder_gives_back_the_cells_of_the_same_question_only(bhr, tmp_path, 
 def test_maps_of_an_older_version_are_refused(bhr, tmp_path):
     (tmp_path / CELLS).write_text('{"robot": "x", "distance_m": 0.1, "height_m": 0.3, "solved": true}\n')
     with pytest.raises(
-        InputError, match=r"cells.jsonl' is no log of this version's 'jumplab envelope'; choose another"
+        InputError, match=r"cells.jsonl' was not written by this version's 'jumplab envelope'; choose another"
     ):
         envelope(bhr, (0.1,), (0.3,), folder=tmp_path)
 

@@ -105,7 +105,7 @@ def test_a_robot_without_such_numbers_is_as_ever(bhr):
     ("armature = -0.1\n", "armature = -0.1 must not be negative"),
     ("friction = -1.0\n", "friction = -1 must not be negative"),
     ("damping = -1.0\n", "damping = -1 must not be negative"),
-    ("armature = 25.0\n", "armature = 25 kg m^2 is more than 10 kg m^2, that of no joint"),
+    ("armature = 25.0\n", "armature = 25 kg m^2 must be at most 10 kg m^2, as joints have"),
     ("effort = 50.0\nvelocity = 20.0\nfriction = 10.0\ndamping = 2.0\n",
      "friction and damping take 50 N m at the speed limit, and the effort is 50 N m"),
     ("velocity = 20.0\nno_load = 15.0\n",

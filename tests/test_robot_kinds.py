@@ -425,7 +425,7 @@ def test_where_it_faces_by_several_signs_and_by_word(put):
     path = put(text)
     found = draft(path)
     assert found.roles.joints["knee"] == ("left_knee", "right_knee") and found.roles.forward == "+x"
-    assert "where it faces is a guess, by the arms' range and the root's x axis" in notes(path)
+    assert "the forward direction is a guess, by the arms' range and the root's x axis" in notes(path)
     turned = check(path, found.text.replace('# facing = "-x"', 'facing = "-x"')).robot
     assert turned.joints["knee"] == ("right_knee", "left_knee") and turned.sagittal.upper[1] == pytest.approx(2.3)
     sideways = found.text.replace('# facing = "-x"', 'facing = "+y"')

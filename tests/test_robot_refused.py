@@ -38,8 +38,9 @@ def test_missing_entries(bhr, line, entry):
 
 
 WRONG = [
-    ('"left_knee"', '"left_elbow"', "robot bhr: role knee names the joint 'left_elbow', which the URDF lacks"),
-    ('"left_foot"', '"left_shoe"', "robot bhr: the foot link 'left_shoe' is not in the URDF"),
+    ('"left_knee"', '"left_elbow"', "robot bhr: role knee names the joint 'left_elbow', "
+     "which the URDF lacks; correct the name"),
+    ('"left_foot"', '"left_shoe"', "robot bhr: the foot link 'left_shoe' is not in the URDF; correct the name"),
     ("corner_speed_ratio = 0.5", "corner_speed_ratio = 1.0",
      "robot configuration: corner_speed_ratio = 1 must lie between 0 and 1"),
     ("corner_speed_ratio = 0.5", "corner_speed_ratio = 0.5\ncorner_speed_ratios = { left_knee = 1.5 }",

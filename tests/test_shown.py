@@ -54,7 +54,7 @@ def test_a_plan_keeps_its_audit_and_how_it_landed(plan, monkeypatch, tmp_path):
     other = replace(plan, task=replace(plan.task, distance_m=0.9))
     assert repr(other) == repr(plan)  # not audited yet
     monkeypatch.setattr("jumplab.studies.advice.plan_or_advise", lambda *_: other)
-    with pytest.warns(UserWarning, match=r"^the plan is returned with its faults: 1 of 51 checks failed: distance$"):
+    with pytest.warns(UserWarning, match=r"^the plan is returned although it has faults: 1 of 51 checks failed: dis"):
         assert jl.plan(plan.task, plan.robot) is other
     assert repr(other).endswith("three-step, " + f"{plan.tape.t[-1]:.2f} s; {other.verdict}>")
     clean = replace(plan)

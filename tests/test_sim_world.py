@@ -145,7 +145,7 @@ def test_friction_that_did_not_arrive_is_refused(bhr, monkeypatch):
         real(body, link, **settings)
 
     monkeypatch.setattr(bullet, "changeDynamics", lossy)
-    with pytest.raises(JumplabError, match=r"PyBullet kept friction 0\.5 on \w+ where 0\.83 was set"):
+    with pytest.raises(JumplabError, match=r"PyBullet has friction 0\.5 on \w+, but 0\.83 was set"):
         engine_class("bullet")(bhr, stance_configuration(bhr), friction=0.83)
 
 

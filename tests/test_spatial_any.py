@@ -179,7 +179,7 @@ def test_what_moves_besides_and_how_it_rests_is_told():
     assert len(robot.joint_names) == 14 and not robot.planar and dict(robot.rest)["left_shoulder_pitch"] == -0.3
     assert stance_configuration(robot)[[13, 20]] == pytest.approx([-0.3, -0.3])
     with pytest.raises(
-        RobotError, match=r"^robot configuration: \[rest\] names the joint 'neck', which does not move$"
+        RobotError, match=r"^robot configuration: \[rest\] names the joint 'neck', which does not move; correct"
     ):
         make_jumper(read_tree(text(root()), "my.urdf"), read_toml(toml + "[rest]\nneck = 0.1\n", "config"))
 

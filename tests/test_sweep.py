@@ -151,7 +151,7 @@ def test_sweeps_share_a_log_and_do_not_mix(tmp_path, monkeypatch):
         assert [row["distance_m"] for row in csv.DictReader(file)] == ["0.1"]
     for old in ("good morning\n", '{"case": "{}", "row": {}}\n'):
         (tmp_path / sweep.CASES).write_text(old)
-        with pytest.raises(InputError, match=r"is no log of this version's 'jumplab sweep'; choose another folder$"):
+        with pytest.raises(InputError, match=r"was not written by this version's 'jumplab sweep'; choose another"):
             swept(sweep.grid([0.1], [0.3]))
 
 

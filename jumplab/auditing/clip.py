@@ -113,7 +113,9 @@ def judge(
     if path.is_dir():
         paths = sorted(x for x in path.iterdir() if x.suffix in ENDINGS)
         if not paths:
-            raise InputError(f"{path}: holds no file that ends in {', '.join(ENDINGS)}")
+            raise InputError(
+                f"{path}: holds no file that ends in {', '.join(ENDINGS)}; give a folder of clips"
+            )
     clips = [clip for one in paths for clip in read_clips(one, robot, fps=fps, order=order)]
     reports = [_judged(clip) for clip in clips]
     return reports if path.is_dir() or len(reports) > 1 else reports[0]

@@ -178,7 +178,10 @@ class Robot(Shown):
         for role, pair in self.joints.items():
             for name in pair:
                 if not self._model.existJointName(name):
-                    raise self.error(f"role {role} names the joint {name!r}, which the URDF lacks")
+                    raise self.error(
+                        f"role {role} names the joint {name!r}, which the URDF lacks; correct "
+                        f"the name"
+                    )
         for name, ratio in self.motors["corner_speed_ratios"].items():
             most = max(1.0, self.motors["no_load_ratios"].get(name, 1.0))
             if not (self._model.existJointName(name) and 0 < ratio < most):
@@ -195,7 +198,7 @@ class Robot(Shown):
                     )
         for name in self.foot.frames:
             if not self._model.existFrame(name, pin.FrameType.BODY):
-                raise self.error(f"the foot link {name!r} is not in the URDF")
+                raise self.error(f"the foot link {name!r} is not in the URDF; correct the name")
 
     def _check_numbers(self) -> None:
         for name, a in self.actuators.items():
@@ -212,7 +215,7 @@ class Robot(Shown):
         try:
             urdf = ET.fromstring(self.urdf)
         except ET.ParseError as e:
-            raise self.error(f"the URDF is no XML: {e}") from None
+            raise self.error(f"the URDF is not XML: {e}") from None
         for joint in urdf.iterfind("joint/limit/.."):
             for key, text in joint.find("limit").items():
                 try:

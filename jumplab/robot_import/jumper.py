@@ -391,7 +391,8 @@ def _toml(
     rest = numbers(config, "rest")
     if unknown := sorted(rest.keys() - {b.joint for b in lumped.bodies.values()}):
         raise RobotError(
-            f"robot configuration: [rest] names the joint {unknown[0]!r}, which does not move"
+            f"robot configuration: [rest] names the joint {unknown[0]!r}, which does not move; "
+            f"correct or remove it"
         )
     motors = ""
     for key in MOTOR:

@@ -103,7 +103,8 @@ def lump(
     trunk = source["trunk"]
     if lost := [link for link in (trunk, *feet) if link not in tree.elements]:
         raise tree.error(
-            f"the configuration names the link {lost[0]!r}, which the {tree.format} lacks"
+            f"the configuration names the link {lost[0]!r}, which the {tree.format} lacks; "
+            f"correct the name"
         )
     moving = _moving_joints(tree, config, roles, trunk, feet)
     held = _held_angles(tree, config, moving)
@@ -149,7 +150,9 @@ def _moving_joints(
         moving += entry(config, "joints", "free", kind=str, count=len(free))
     for name in moving:
         if name not in tree.joints:
-            raise tree.error(f"a role names the joint {name!r}, which the {tree.format} lacks")
+            raise tree.error(
+                f"a role names the joint {name!r}, which the {tree.format} lacks; correct the name"
+            )
         joint = tree.joints[name]
         if not joint.driven:
             kind = "a mimic" if joint.mimic else joint.kind
@@ -184,7 +187,10 @@ def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str,
             out[joint.name] = float(np.clip(0.0, *sorted(ends)))
     for name in locked:
         if name not in tree.joints:
-            raise tree.error(f"[locked] names the joint {name!r}, which the {tree.format} lacks")
+            raise tree.error(
+                f"[locked] names the joint {name!r}, which the {tree.format} lacks; correct the "
+                f"name"
+            )
         out[name] = entry(config, "locked", name)
     for joint in tree.joints.values():  # a follower goes where its leader is held
         if joint.mimic and joint.name not in locked:
@@ -283,8 +289,8 @@ def _motor_fault(limits: dict[str, float]) -> str:
         return f"{negative[0]} must not be negative"
     if armature > MOST_ARMATURE:
         return (
-            f"armature = {armature:g} kg m^2 is more than {MOST_ARMATURE:g} kg m^2, that of no "
-            f"joint"
+            f"armature = {armature:g} kg m^2 must be at most {MOST_ARMATURE:g} kg m^2, as joints "
+            f"have"
         )
     if lost >= effort:
         return (

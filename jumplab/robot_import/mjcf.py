@@ -563,7 +563,7 @@ class _Writer:
         tendons = listed(model.tendon(t).name or t for t in range(model.ntendon))
         others = listed(self.motors.others)
         for names, sentence in (
-            (counted, "the joints {} count from their ref, as 0"),
+            (counted, "the joints {} have their zero at their ref"),
             (springs, "the springs of the joints {} are left out"),
             (tendons, "the tendons {} are left out"),
             (others, "the actuators {} act on no joint: their torque is not counted"),

@@ -278,9 +278,9 @@ class _Finder:
             by = " and ".join(name for name, vote in votes.items() if vote * total > 0)
             even = "the feet reach as far ahead as behind"
             notes.append(
-                f"where it faces is a guess, by {by or 'nothing'}: the knees bend both ways, and "
-                f"{', '.join(against) + ' disagree' if against else even}; if it faces the "
-                f"other way, give [source] facing"
+                f"the forward direction is a guess, by {by or 'nothing'}: the knees bend both "
+                f"ways, and {', '.join(against) + ' disagree' if against else even}; if the "
+                f"robot faces the other way, give [source] facing"
             )
         return left if total > 0 else -left
 

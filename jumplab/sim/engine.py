@@ -220,7 +220,7 @@ class Engine(ABC):
         for name, there in kept.friction.items():
             if abs(there - friction) > ROUNDING:
                 raise JumplabError(
-                    f"{self.title} kept friction {there:g} on {name} where {friction:g} was set"
+                    f"{self.title} has friction {there:g} on {name}, but {friction:g} was set"
                 )
         if abs(kept.mass_kg - self.robot.total_mass) > MASS_KG:
             weight = f"{self.title}'s robot weighs {kept.mass_kg:.4f} kg"

@@ -161,7 +161,7 @@ def open_study(
             log = stack.enter_context(open_log(path, command, entry))
             if kind is None and not (log.empty or log.done):
                 raise InputError(
-                    f"{str(path)!r} is no log of this version's 'jumplab {command}'; "
+                    f"{str(path)!r} was not written by this version's 'jumplab {command}'; "
                     f"choose another folder"
                 )
         hidden = None if progress is None else not progress

@@ -149,15 +149,15 @@ class Contacts:
                 yield f"phase {p.name!r}: {fault}"
             if k and p.feet == phases[k - 1].feet:
                 yield (
-                    f"phase {p.name!r}: the same feet carry as in the phase before; make one phase "
-                    f"of them"
+                    f"phase {p.name!r}: the same feet are on the ground as in the phase before; "
+                    f"make one phase of them"
                 )
         first = phases[0]
         last = phases[-1]
         if not first.feet.isupper():
             yield (
-                f"phase {first.name!r}: a schedule begins on flat feet, at rest; there is no "
-                f"support to wait on"
+                f"phase {first.name!r}: a schedule must begin at rest on flat feet, where the "
+                f"robot can wait; begin with 'LR'"
             )
         names = [p.name for p in phases]
         if twice := sorted({n for n in names if names.count(n) > 1}):
@@ -178,7 +178,10 @@ class Contacts:
         landings = [(k, side) for k, (old, p) in pairs for side in p.modes if side not in old]
         object.__setattr__(self, "landings", tuple(landings))
         if self.first and len(self.first) != len(first.modes):
-            yield f"first: {len(self.first)} places given for {len(first.modes)} feet that stand"
+            yield (
+                f"first: {len(self.first)} places given for {len(first.modes)} feet that "
+                f"stand; give one per foot"
+            )
         later = landings[len(first.modes) :]
         if len(self.places) != len(later):
             came = [f"{SIDES[side]} in phase {phases[k].name!r}" for k, side in later]
