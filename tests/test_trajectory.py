@@ -123,7 +123,7 @@ OBJECTS = np.array([{}] * N, dtype=object)
         ("q", OBJECTS, "not a readable plan (ValueError); it may be truncated"),
         ("schema", np.array("jumplab-plan-0"), SCHEMAS.format("jumplab-plan-0")),
         ("schema", None, SCHEMAS.format("none")),
-        *((name, None, f"the array {name!r} is missing") for name in ("t", "tau", "joint_names")),
+        *((name, None, f"the array {name!r} is missing; plan the jump again") for name in ("t", "tau", "joint_names")),
     ],
 )
 def test_foreign_arrays_are_refused(tmp_path, name, value, sentence):
