@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import RobotError
 from jumplab.robot.files import entry, numbers, read_toml
 
 if TYPE_CHECKING:  # a robot is asked for these
@@ -99,7 +98,9 @@ def _locked(
         mass = part.mass + sum(below.mass[own.getJointId(name)] for name in limbs)
         if effort > 0 and mass > HEAVY * robot.total_mass:
             place = (to_base * data.oMi[j]).translation
-            axis = to_base.rotation @ data.J[3:, column]
+            # seen from a part that floats, with the base beyond, its joint turns the other way
+            way = 1.0 if j in beyond else -1.0
+            axis = way * to_base.rotation @ data.J[3:, column]
             out.append(LockedJoint(model.names[j], effort, place, axis, part, limbs))
     return out
 
