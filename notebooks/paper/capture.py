@@ -20,7 +20,7 @@ from jumplab.task import JumpTask
 from paper import logs
 
 LOG = Path(__file__).with_name("capture.jsonl")
-ROBOTS = {"bhr": (2.44, 0.33), "g1": (1.8, 0.25)}  # farthest distance and rise [m]
+ROBOTS = {"bhr": (2.44, 0.33), "g1": (1.04, 0.15)}  # farthest distance and rise [m]
 NEAREST_M = 0.2
 COUNT = 15  # jumps a robot
 
