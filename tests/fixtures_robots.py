@@ -173,19 +173,37 @@ def arm_base() -> tuple[str, str]:
     return text(robot), config("arm_base")
 
 
-def waist() -> tuple[str, str]:
+def waist(chest_kg: float = 2.0) -> tuple[str, str]:
     """The root is a chest above a waist joint; the legs hang on a pelvis below it."""
     robot = root()
     chest = ET.SubElement(robot, "link", name="chest")
     inertial = ET.SubElement(chest, "inertial")
     ET.SubElement(inertial, "origin", xyz="0.02 0 0.1")
-    ET.SubElement(inertial, "mass", value="2")
+    ET.SubElement(inertial, "mass", value=str(chest_kg))
     ET.SubElement(inertial, "inertia", ixx="0.01", ixy="0", ixz="0.002", iyy="0.012", iyz="0", izz="0.008")
     j = _fixed(robot, "chest", "trunk", "revolute", xyz="0 0 0")
     j.set("name", "waist")
     ET.SubElement(j, "axis", xyz="0 1 0")
     ET.SubElement(j, "limit", lower="-0.5", upper="0.5", effort="100", velocity="5")
     return text(robot), config("waist") + "[locked]\nwaist = -0.1\n"
+
+
+def torso(effort: float = 100.0) -> tuple[str, str]:
+    """The legs hang on a pelvis; a waist of ``effort`` [N m], which no jump moves, carries trunk and arms."""
+    robot = root()
+    pelvis = ET.SubElement(robot, "link", name="pelvis")
+    inertial = ET.SubElement(pelvis, "inertial")
+    ET.SubElement(inertial, "origin", xyz="0 0 0.02")
+    ET.SubElement(inertial, "mass", value="3")
+    ET.SubElement(inertial, "inertia", ixx="0.02", ixy="0", ixz="0", iyy="0.01", iyz="0", izz="0.02")
+    for j in robot.findall("joint"):
+        if j.get("name").endswith(("_hip_yaw", "_hip_roll", "_hip_pitch")) and j.find("parent").get("link") == "trunk":
+            j.find("parent").set("link", "pelvis")
+    j = _fixed(robot, "pelvis", "trunk", "revolute", xyz="0 0 0")
+    j.set("name", "waist")
+    ET.SubElement(j, "axis", xyz="0 1 0")
+    ET.SubElement(j, "limit", lower="-0.5", upper="0.5", effort=str(effort), velocity="5")
+    return text(robot), config("torso", trunk="pelvis")
 
 
 def sideways() -> tuple[str, str]:
@@ -205,7 +223,7 @@ def canted(angle_rad: float) -> tuple[str, str]:
     return text(robot), config("canted")
 
 
-VARIANTS = (plain, mirrored, child, one_axis_ankle, roll_first, heavy_arms, held_arms, arm_base, waist, sideways)
+VARIANTS = (plain, mirrored, child, one_axis_ankle, roll_first, heavy_arms, held_arms, arm_base, waist, torso, sideways)
 
 
 def write(folder, variant, *args) -> str:

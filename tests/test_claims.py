@@ -501,4 +501,5 @@ def test_the_book_has_the_stored_counts():
     page = (Path(__file__).parent.parent / "notebooks" / "book" / "validity.md").read_text(encoding="utf-8")
     rows = [*worlds.counts(), *worlds.contact_counts()]
     assert len(rows) == 12 and all(f"\n{row}\n" in page for row in rows), "python -m paper.worlds --counts"
-    assert capture.line() in " ".join(page.split()), "python -m paper.capture"
+    for robot in capture.ROBOTS:
+        assert capture.line(robot) in " ".join(page.split()), "python -m paper.capture"

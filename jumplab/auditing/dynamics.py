@@ -103,7 +103,7 @@ def available_torque(r: Replay) -> np.ndarray:
 
 
 def joints(r: Replay) -> Iterator[Measure]:
-    """Measures of the group "joints": range, speed, torque, torque at speed."""
+    """Measures of the group "joints": range, speed, torque, torque at speed, torques that hold."""
     t = r.tape.t
     m = r.model
     angle = r.tape.q[:, 7:]
@@ -113,6 +113,9 @@ def joints(r: Replay) -> Iterator[Measure]:
     yield "joint speed", np.abs(r.tape.v[:, 6:]) / m.upperVelocityLimit[6:], t, r.joints
     yield "joint torque", torque / m.upperEffortLimit[6:], t, r.joints
     yield "torque at speed", torque / available_torque(r), t, r.joints
+    if locked := r.robot.locked:
+        holding = np.abs(r.holding) / [x.effort for x in locked]
+        yield "torque of locked joints", holding, t, tuple(x.name for x in locked)
 
 
 def description(r: Replay) -> Iterator[Measure]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
@@ -15,6 +16,7 @@ from jumplab.auditing.report import METHOD, of_size
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.robot.locked import LockedJoint
 from jumplab.robot.motors import SLIDING_RATE
 from jumplab.task import GRAVITY, JumpTask
 
@@ -65,6 +67,7 @@ class Replay:
     base_residual: np.ndarray
     tau: np.ndarray  # (N, nv - 6) motor torques that the motion and the contact wrenches need [N m]
     lost: np.ndarray  # (N, nv - 6) of them, what the motors' friction takes [N m]
+    holding: np.ndarray  # (N, H) torques that hold the robot's locked joints [N m]
 
     @cached_property
     def joints(self) -> tuple[str, ...]:
@@ -256,7 +259,7 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
         raise RobotError(
             f"robot {robot.name}: its collision shapes cannot be read: {str(e).splitlines()[0]}"
         ) from e
-    motion = _motion(tape, model, frames)
+    motion = _motion(tape, model, frames, robot.locked)
     rates = tape.v[:, 6:]
     motors = robot.limits  # of the tape's joints, in their order
     lost = motors.friction * np.tanh(rates / SLIDING_RATE) + motors.damping * rates
@@ -288,11 +291,28 @@ def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: in
     return Sole(heel, toe, right, left, z)
 
 
-def _motion(tape: Tape, model: pin.Model, frames: list[int]) -> dict[str, np.ndarray]:
+def _held(
+    model: pin.Model, inverse: pin.Data, locked: Sequence[LockedJoint], limbs: list[list[int]]
+) -> list[float]:
+    """Torques (H,) of locked joints: what their parts need, and the ``limbs`` on them, by inverse
+    dynamics that has just been done."""
+    torques = []
+    for joint, beyond in zip(locked, limbs, strict=True):
+        need = joint.part * inverse.a_gf[1] + joint.part.vxiv(inverse.v[1])
+        for k in beyond:
+            need += inverse.liMi[k].act(inverse.f[k])
+        torques.append(float(joint.axis @ (need.angular - np.cross(joint.place, need.linear))))
+    return torques
+
+
+def _motion(
+    tape: Tape, model: pin.Model, frames: list[int], locked: Sequence[LockedJoint]
+) -> dict[str, np.ndarray]:
     """The mechanical fields of :class:`Replay`, by name; torques without what motors add."""
     data = model.createData()
     inverse = model.createData()
     mass = pin.computeTotalMass(model)
+    limbs = [[model.getJointId(name) for name in joint.joints] for joint in locked]
     rows = []
     for q, v, a, wrenches in zip(tape.q, tape.v, tape.a, tape.f, strict=True):
         pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
@@ -315,6 +335,7 @@ def _motion(tape: Tape, model: pin.Model, frames: list[int]) -> dict[str, np.nda
             "foot_rotation": [data.oMf[frame].rotation.copy() for frame in frames],
             "base_residual": about_com.actInv(data.oMi[1].act(pin.Force(need[:6]))).vector,
             "tau": need[6:].copy(),
+            "holding": _held(model, inverse, locked, limbs),
         }
         rows.append(row)
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}

@@ -19,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.robot.locked import LockedJoint
 from jumplab.robot.reduction import EXACT_M, mirror
 from jumplab.task import GRAVITY
 
@@ -44,6 +45,11 @@ class Link:
     mass: float  # [kg]
     first: np.ndarray  # (3,) mass times CoM [kg m]
     second: np.ndarray  # (3, 3) inertia about the origin [kg m^2]
+
+    @property
+    def numbers(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """mass, first, second."""
+        return self.mass, self.first, self.second
 
 
 def _clean(x: np.ndarray) -> np.ndarray:
@@ -381,16 +387,20 @@ class SpatialState:
         axial = {}
         for k in self._counted[:0:-1]:
             b = self.model.bodies[k]
-            ((_, turn),) = self._turns[k]
-            force, moment = parts[k]
-            axial[k] = moment[b.axis]
-            force = turn.out(force)
-            moment = turn.out(moment) + cross(b.place, force)
-            if (across := self._doubled(k)) is not None:
-                force = 2 * (force - along(across, force[across]))
-                moment = 2 * along(across, moment[across])
+            axial[k] = parts[k][1][b.axis]
+            force, moment = self._at_parent(k, *parts[k])
             parts[b.parent] = parts[b.parent][0] + force, parts[b.parent][1] + moment
         return *(self._to_world(x) for x in parts[0]), axial
+
+    def _at_parent(self, k: int, force: ca.SX, moment: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """A (force-like, moment-like) pair of a body at its parent's origin, in its axes; of both
+        sides of an even motion where they meet."""
+        ((_, turn),) = self._turns[k]
+        force = turn.out(force)
+        moment = turn.out(moment) + cross(self.model.bodies[k].place, force)
+        if (across := self._doubled(k)) is None:
+            return force, moment
+        return 2 * (force - along(across, force[across])), 2 * along(across, moment[across])
 
     def _to_world(self, x: ca.SX) -> ca.SX:
         """A vector (3,) of the base in world axes."""
@@ -408,22 +418,59 @@ class SpatialState:
         body's axes. In an even motion those on the left half stand for those on the right one too,
         and torques of the right half mean nothing.
         """
-        parts = {}
-        for k in self._counted:
-            b = self.model.bodies[k]
-            spin = self._spins[k]
-            linear, angular = self._accelerations[k]
-            first = ca.DM(b.first)
-            second = ca.DM(b.second)
-            force = b.mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
-            moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
-            if k in wrenches:
-                force = force - wrenches[k][0]
-                moment = moment - wrenches[k][1]
-            parts[k] = force, moment
+        parts = dict(self._inertial)
+        for k in parts.keys() & wrenches.keys():
+            parts[k] = tuple(a - b for a, b in zip(parts[k], wrenches[k], strict=True))
         force, moment, axial = self._gathered(parts)
         torques = [axial.get(k, ca.SX(0)) for k in range(1, len(self.model.bodies))]
         return force, moment, ca.vertcat(ca.SX(0, 1), *torques) + self.model.armature * self.a[6:]
+
+    @cached_property
+    def _inertial(self) -> dict[int, tuple[ca.SX, ca.SX]]:
+        """(force, moment about its origin) that the motion of each body needs, in its axes."""
+        bodies = self.model.bodies
+        return {k: self._moved(k, *bodies[k].numbers) for k in self._counted}
+
+    def _moved(
+        self, k: int, mass: float, first: np.ndarray, second: np.ndarray
+    ) -> tuple[ca.SX, ca.SX]:
+        """The same of anything that is rigid with a body; see :class:`Link`."""
+        spin = self._spins[k]
+        linear, angular = self._accelerations[k]
+        first = ca.DM(first)
+        second = ca.DM(second)
+        force = mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
+        moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
+        return force, moment
+
+    def _passed(self, k: int) -> tuple[ca.SX, ca.SX]:
+        """(force, moment) at the origin of its parent, in its axes, that all beyond a joint needs;
+        nothing touches it."""
+        force, moment = self._inertial[k]
+        for child in self._counted:
+            if child and self.model.bodies[child].parent == k:
+                more = self._passed(child)
+                force = force + more[0]
+                moment = moment + more[1]
+        return self._at_parent(k, force, moment)
+
+    def locked_torque(self, joint: LockedJoint) -> ca.SX:
+        """Torque with which a joint that never moves holds its part on the base [N m].
+
+        In an even motion a joint in the middle holds both sides; one beside it holds no limb that
+        moves.
+        """
+        part = joint.part
+        first = part.mass * part.lever
+        lever = pin.skew(part.lever)
+        second = part.inertia - part.mass * lever @ lever
+        force, moment = self._moved(0, part.mass, first, second)
+        for k in self._counted:
+            if self.model.bodies[k].name in joint.joints:
+                more = self._passed(k)
+                force = force + more[0]
+                moment = moment + more[1]
+        return ca.dot(ca.DM(joint.axis), moment - cross(ca.DM(joint.place), force))
 
     @cached_property
     def _momenta(self) -> tuple[ca.SX, ca.SX]:

@@ -32,6 +32,7 @@ from jumplab.robot.files import (
     read_toml,
     roles_table,
 )
+from jumplab.robot.locked import LockedJoint, locked_joints
 from jumplab.robot.motors import MotorLimits, read_only
 from jumplab.robot.reduction import in_plane
 from jumplab.robot.sagittal import SagittalModel, reduce
@@ -373,6 +374,11 @@ class Robot(Shown):
         ends = m.lowerPositionLimit[q], m.upperPositionLimit[q]
         effort = m.upperEffortLimit[v]
         return MotorLimits(*ends, speed, effort, corner * speed, no_load * speed, *losses)
+
+    @cached_property
+    def locked(self) -> tuple[LockedJoint, ...]:
+        """Joints of the published robot that hold heavy parts on the base and never move."""
+        return locked_joints(self)
 
     @cached_property
     def actuators(self) -> Mapping[str, Mapping[str, float]]:

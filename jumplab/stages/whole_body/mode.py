@@ -8,7 +8,9 @@ import casadi as ca
 import numpy as np
 
 from jumplab.robot.contact import pyramid
+from jumplab.robot.locked import LockedJoint
 from jumplab.robot.motors import MotorLimits
+from jumplab.robot.reduction import EXACT_M
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES, modes_of
 from jumplab.stages.whole_body.coordinates import BASE, Coordinates, whole
@@ -32,6 +34,7 @@ class Mode:
         foot stands for both.
     integrated : coordinates that do not follow from feet in place or from flight.
     held : joints of the left half that are held and have to carry something.
+    locked : of the published robot, joints that never move and have to carry something.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class Mode:
             for k in (self.model.left_half if free.plane and not self.robot.planar else ())
             if self.model.across[k] is None and k - 1 not in free.joints
         ]
+        self.locked = [x for x in self.robot.locked if not (free.even and _idle(x))]
 
     @property
     def usable_torques(self) -> np.ndarray:
@@ -125,3 +129,9 @@ class Mode:
         angles = [k for k in self.free.free if 3 <= k < BASE]
         joints = BASE + np.flatnonzero(np.abs(self.free.spread[BASE:]).any(axis=1))
         return self.free.chart(x, 1)[[*angles, *joints.tolist()]]
+
+
+def _idle(joint: LockedJoint) -> bool:
+    """Whether a joint has nothing to hold in an even motion, or its mirror image tells as much."""
+    beside = joint.place[1]
+    return beside < -EXACT_M or (beside < EXACT_M and abs(joint.axis[1]) < EXACT_M)

@@ -73,14 +73,14 @@ def smoothness(m: Mode) -> list[Term]:
 
 def dynamics(m: Mode, skip: tuple[int, int]) -> list[Term]:
     """Newton and Euler, M q'' + h = S tau + J^T f: nothing but the ground moves the base [N, N m],
-    joint torques go with the motion [of the effort], and motors of joints that are held can hold
-    them. ``skip`` is (first, last) nodes without rows.
+    joint torques go with the motion [of the effort], and motors of joints that are held, in this
+    jump or in every one, can hold them. ``skip`` is (first, last) nodes without rows.
     """
     free = m.free
     mg = m.body.mg
     shared = {"skip": skip, "group": "dynamics"}
     how = shared | {"identity": True}
-    effort = m.body.motors.effort[m.held]
+    effort = np.array([*m.body.motors.effort[m.held], *(x.effort for x in m.locked)])
 
     def torques(p):
         return (p.needed[2][free.joints] - p.motor_torques) / ca.DM(m.motors.effort)
@@ -92,15 +92,17 @@ def dynamics(m: Mode, skip: tuple[int, int]) -> list[Term]:
         return p.needed[1][free.spins]
 
     def holding(p):
-        return p.needed[2][m.held] / ca.DM(effort)
+        locked = [p.tree.locked_torque(x) for x in m.locked]
+        return ca.vertcat(p.needed[2][m.held], *locked) / ca.DM(effort)
 
     rows = [
         Term("joint dynamics", "ours", "of the effort", "node", torques, **how),
         Term("base forces", "ours", "N", "node", forces, **how, scale=mg),
         Term("base moments", "ours", "N m", "node", moments, **how, scale=MOMENT_ARM_M * mg),
     ]
-    if m.held:
-        most = m.usable_torques[m.held] / effort
+    if len(effort):
+        locked = [m.limits.torque_share * x.effort for x in m.locked]
+        most = np.array([*m.usable_torques[m.held], *locked]) / effort
         words = "torques of held joints", "ours: limit", "of the effort", "node"
         rows.append(Term(*words, holding, lower=-most, upper=most, **shared))
     return rows

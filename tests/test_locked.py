@@ -1,0 +1,89 @@
+"""Joints of a published robot that no jump moves: what holds them, in the model, in plans and in the audit."""
+
+import casadi as ca
+import fixtures_robots as robots
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import jumplab as jl
+from jumplab.auditing.audit import audit
+from jumplab.io.motion import Motion
+from jumplab.io.whole import Whole
+from jumplab.models.spatial import SpatialModel, SpatialState
+from jumplab.robot import Robot
+
+TASK = jl.JumpTask(0.4, 0.2)
+CHECK = "torque of locked joints"
+
+
+def loaded(tmp_path, variant, *args) -> Robot:
+    return Robot.load(robots.write(tmp_path, variant, *args))
+
+
+def held(robot: Robot, q, v, a) -> dict[str, float]:
+    """Torques of the published robot's joints in a state of the one that jumps, by Pinocchio [N m]."""
+    whole = Whole(robot)
+    still = np.zeros(robot.model.nv - 6)
+    one = Motion(np.zeros(1), q[None], v[None], still[None], np.array(["launch"]), "plan")
+    state, rates = (x[0] for x in whole.states(whole.frames(one, 1000.0)))
+    root = pin.XYZQUATToSE3(q[:7]).actInv(pin.XYZQUATToSE3(state[:7]))
+    own = dict(zip(robot.joint_names, a[6:], strict=True))
+    gain = [*root.actInv(pin.Motion(a[:6])).vector, *(own.get(name, 0.0) for name in whole.model.names[2:])]
+    model = whole.model
+    data = model.createData()
+    motion = state, rates, np.array(gain)
+    # the ground's forces reach all else through the body that carries the legs
+    need = pin.Force(pin.rnea(model, data, *motion)[:6])
+    trunk = model.frames[model.getFrameId("pelvis" if model.existBodyName("pelvis") else "trunk")].parentJoint
+    push = [pin.Force.Zero() for _ in range(model.njoints)]
+    push[trunk] = data.oMi[trunk].actInv(data.oMi[1].act(need))
+    return dict(zip(model.names[2:], pin.rnea(model, data, *motion, push)[6:], strict=True))
+
+
+@pytest.mark.parametrize("variant, args", [(robots.torso, ()), (robots.waist, (4.0,))])
+def test_they_hold_what_the_published_robot_needs(tmp_path, variant, args):
+    """The tree of the program against Pinocchio on all joints: waists above the legs and below the root."""
+    robot = loaded(tmp_path, variant, *args)
+    model = SpatialModel(robot.model)
+    q, v, a = (ca.SX.sym(x, len(model.names)) for x in "qva")
+    state = SpatialState(model, q, v, a)
+    told = ca.Function("told", [q, v, a], [state.locked_torque(x) for x in robot.locked])
+    rng = np.random.default_rng(4)
+    assert robot.locked
+    for _ in range(4):
+        motion = rng.normal(size=(3, len(model.names)))
+        found = [float(x) for x in told.call([*motion])]
+        needed = held(robot, *(x[0] for x in model.to_pinocchio(*motion[:, None])))
+        assert found == pytest.approx([needed[x.name] for x in robot.locked], abs=1e-6)
+        assert max(map(abs, found)) > 0.1
+
+
+def test_parts_that_weigh_little_are_no_load(tmp_path):
+    """A chest of 4 kg of 46 is one, of 2 kg of 44 none; a robot without [published] has none."""
+    assert [x.name for x in loaded(tmp_path, robots.waist, 4.0).locked] == ["waist"]
+    assert loaded(tmp_path, robots.waist, 2.0).locked == ()
+    assert Robot.load().locked == ()
+
+
+def test_a_changed_trunk_is_a_changed_load(tmp_path):
+    robot = loaded(tmp_path, robots.torso)
+    heavier = robot.with_mass("pelvis", factor=1.5)
+    assert heavier.locked[0].part.mass == pytest.approx(1.5 * robot.locked[0].part.mass)
+
+
+def test_plans_keep_within_a_weak_waist(tmp_path):
+    """A plan for a strong waist fails the audit of a weak one, at the joint and by the torque that Pinocchio finds;
+    a plan for the weak one passes."""
+    strong = loaded(tmp_path, robots.torso)
+    plan = jl.plan(TASK, strong)
+    (check,) = (x for x in plan.audit.checks if x.name == CHECK)
+    needed = [abs(held(strong, *row)["waist"]) for row in zip(plan.tape.q, plan.tape.v, plan.tape.a, strict=True)]
+    assert check.value == pytest.approx(max(needed), rel=1e-6)  # of 100 N m
+    assert check.passed and "waist" in check.note
+    weak = loaded(tmp_path, robots.torso, 0.7 * max(needed))
+    (check,) = (x for x in audit(plan.tape, weak, TASK).checks if x.name == CHECK)
+    assert check.value == pytest.approx(100 / 0.7, rel=1e-6) and not check.passed
+    again = jl.plan(TASK, weak)
+    (check,) = (x for x in again.audit.checks if x.name == CHECK)
+    assert check.passed and again.audit.passed
