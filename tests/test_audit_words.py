@@ -96,7 +96,7 @@ def test_table_and_json_word_for_word():
     fast = AuditReport(checks[:1], {}, LIMITS["capture point"].check(0.7))
     words = (
         "but it lands too fast to be caught: the capture point lies 70 % of the CoM's height outside the "
-        "soles, at most 40 were caught; ask for less distance or rise"
+        "soles, over the limit of 27; ask for less distance or rise"
     )
     assert fast.passed and not fast.sound and fast.line() == f"all 1 checks passed; {words}"
     assert fast.table().endswith(f"\n{words}") and json.loads(fast.to_json())["capture"]["value"] == 70

@@ -147,7 +147,7 @@ class AuditReport(Shown):
             return ""
         return (
             f"but it lands too fast to be caught: the {c.name} lies {c.value:.0f} {c.unit} outside "
-            f"the soles, at most {c.limit:g} were caught; ask for less distance or rise"
+            f"the soles, over the limit of {c.limit:g}; ask for less distance or rise"
         )
 
     @property

@@ -132,6 +132,6 @@ class Mode:
 
 
 def _idle(joint: LockedJoint) -> bool:
-    """Whether a joint has nothing to hold in an even motion, or its mirror image tells as much."""
+    """Whether a joint has nothing to hold in an even motion, or its mirror image holds as much."""
     beside = joint.place[1]
     return beside < -EXACT_M or (beside < EXACT_M and abs(joint.axis[1]) < EXACT_M)
