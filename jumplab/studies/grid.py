@@ -27,7 +27,12 @@ CELLS = "cells.jsonl"
 MAX_CELLS = 2500  # an hour or two of work
 GIVE_UP = 2  # so many cells in a row without a plan, and the farther ones of the row are not tried
 # checks of the audit
-USES = {"torque at speed": "torque", "joint speed": "speed", "friction used": "friction"}
+USES = {
+    "torque at speed": "torque",
+    "torque of locked joints": "torque",
+    "joint speed": "speed",
+    "friction used": "friction",
+}
 COLUMNS = (
     "planned",
     "clean",

@@ -27,10 +27,11 @@ from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits, Mesh, bounds
 from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.mode import held_joints
 from jumplab.stages.whole_body.problem import SOUGHT
 from jumplab.stages.whole_body.program import Program, Solved
 from jumplab.stages.whole_body.starts import RECORD, SEEKING, Asked
-from jumplab.stages.whole_body.terms import TORQUE_SPEED, WORTH
+from jumplab.stages.whole_body.terms import HOLDING, TORQUE_SPEED, WORTH
 from jumplab.studies.advice import keep_record
 from jumplab.studies.prices import Prices, priced
 from jumplab.task import RANGES, JumpTask
@@ -429,6 +430,10 @@ def _limit(
         return (f"duration of {phase.name}", "") if column == 0 else None
     if term == TORQUE_SPEED:
         return term, program.body.joint_names[program.free.joints[column]]
+    if term == HOLDING:
+        held, locked = held_joints(program.body, program.free)
+        names = [program.body.joint_names[k] for k in held] + [x.name for x in locked]
+        return "torque", names[column]
     if term != "bounds of nodes":
         return term, ""
     count = len(phase.coordinates)

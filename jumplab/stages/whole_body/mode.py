@@ -33,8 +33,7 @@ class Mode:
     sides : those of the modes that have rows and forces of their own; in an even motion the left
         foot stands for both.
     integrated : coordinates that do not follow from feet in place or from flight.
-    held : joints of the left half that are held and have to carry something.
-    locked : of the published robot, joints that never move and have to carry something.
+    held, locked : that have to carry something, see :func:`held_joints`.
     """
 
     def __init__(
@@ -75,12 +74,7 @@ class Mode:
             follows |= {1, 3, 4}
         gone = {self.model.names[k] for k in follows}
         self.integrated = tuple(x for x in self.coordinates if x not in gone)
-        self.held = [
-            k - 1
-            for k in (self.model.left_half if free.plane and not self.robot.planar else ())
-            if self.model.across[k] is None and k - 1 not in free.joints
-        ]
-        self.locked = [x for x in self.robot.locked if not (free.even and _idle(x))]
+        self.held, self.locked = held_joints(body, free)
 
     @property
     def usable_torques(self) -> np.ndarray:
@@ -129,6 +123,18 @@ class Mode:
         angles = [k for k in self.free.free if 3 <= k < BASE]
         joints = BASE + np.flatnonzero(np.abs(self.free.spread[BASE:]).any(axis=1))
         return self.free.chart(x, 1)[[*angles, *joints.tolist()]]
+
+
+def held_joints(body: Body, free: Coordinates) -> tuple[list[int], list[LockedJoint]]:
+    """Joints of the left half that are held in such a motion, as indices, and those of the
+    published robot that never move; both have to carry something."""
+    model = body.model
+    held = [
+        k - 1
+        for k in (model.left_half if free.plane and not body.robot.planar else ())
+        if model.across[k] is None and k - 1 not in free.joints
+    ]
+    return held, [x for x in body.robot.locked if not (free.even and _idle(x))]
 
 
 def _idle(joint: LockedJoint) -> bool:

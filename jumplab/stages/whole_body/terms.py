@@ -31,6 +31,7 @@ SOLE_SHARES = 0.0, 0.25, 0.5, 0.75, 1.0  # of the way from toes to heel
 TORSION_SLACK_M = 1e-4  # where a foot hardly carries both sides of the row vanish
 CAPTURE = "replaces WF-E2"
 TORQUE_SPEED = "torque-speed"  # the term of the motors' lines
+HOLDING = "torques of held joints"  # the term of :func:`.held_joints`
 RECORD = "record"  # the term of what is largest
 FAR = 100.0  # [m, m/s, rad] beyond any of it, so that its cost is nearly a straight line
 # of one of these units of it, in units of the effort: with more of it, motions leave the physics
@@ -103,7 +104,7 @@ def dynamics(m: Mode, skip: tuple[int, int]) -> list[Term]:
     if len(effort):
         locked = [m.limits.torque_share * x.effort for x in m.locked]
         most = np.array([*m.usable_torques[m.held], *locked]) / effort
-        words = "torques of held joints", "ours: limit", "of the effort", "node"
+        words = HOLDING, "ours: limit", "of the effort", "node"
         rows.append(Term(*words, holding, lower=-most, upper=most, **shared))
     return rows
 
