@@ -134,7 +134,7 @@ def robot_of(name):
 def test_refusals_of_five_robots_are_followed():
     """Random targets beyond what they can do; each advice is followed by a planner that has not seen it before."""
     rng, followed, tried = random.Random(7), 0, 0
-    robots = ["bhr", "alexander", "g1", "talos", "weak"]
+    robots = ["bhr", "alexander", "g1_legs", "talos", "weak"]
     while followed < REFUSALS and tried < 4 * REFUSALS:
         name, tried = robots[tried % len(robots)], tried + 1
         far = 3.0 if name in ("bhr", "weak") else 1.5

@@ -86,7 +86,7 @@ def test_no_plan_of_the_default_robot_beats_a_bound(body, target):
 
 
 @published
-@pytest.mark.parametrize(("robot", "rise"), [("g1", 0.2), ("talos", 0.08)])
+@pytest.mark.parametrize(("robot", "rise"), [("g1_legs", 0.2), ("talos", 0.08)])
 def test_no_plan_of_a_published_robot_beats_a_bound(robot, rise):
     plan = jl.plan(jl.JumpTask(0.3, rise), robot)
     body = Body(plan.robot)

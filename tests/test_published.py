@@ -32,7 +32,7 @@ from jumplab.stages.whole_body.terms import smoothness, touchdown_rows
 from jumplab.task import JumpTask
 
 DOWNLOADED = [name for name, path in SHIPPED.items() if "robot_descriptions:" in path.read_text()]
-SPATIAL = ("g1_arms", "g1_23", "g1_29")
+SPATIAL = ("g1_arms", "g1", "g1_29")
 PUBLISHED = [name for name in SHIPPED if name not in ("bhr", *SPATIAL, *DOWNLOADED)]
 
 
@@ -49,7 +49,7 @@ def test_without_the_package_the_way_to_it_is_told():
         Robot.load("g1")
 
 
-KG = {"g1": 33.341, "talos": 93.336, "romeo": 40.529, "alexander": 49.081}
+KG = {"g1_legs": 33.341, "talos": 93.336, "romeo": 40.529, "alexander": 49.081}
 
 
 def is_as_configured(name: str, robot: Robot, repair: tuple[str, ...]) -> None:
@@ -79,7 +79,7 @@ def test_motors_of_the_g1_are_the_makers():
 
 @here
 @pytest.mark.slow
-@pytest.mark.parametrize("name, target", [("g1", (0.4, 0.2)), ("g1_23", (0.3, 0.15)), ("talos", (0.2, 0.05))])
+@pytest.mark.parametrize("name, target", [("g1_legs", (0.4, 0.2)), ("g1", (0.3, 0.15)), ("talos", (0.2, 0.05))])
 def test_planned_clean_and_landed(name, target):
     robot = Robot.load(name)
     plan = Planner(robot).plan(JumpTask(*target))
@@ -99,7 +99,7 @@ def test_the_whole_g1_moves_evenly():
     """Waist and arms: half of the unknowns, and a cost that keeps those without a role near the stance; arms alone
     have none.
     """
-    body, arms = (Body(Robot.load(name)) for name in ("g1_23", "g1_arms"))
+    body, arms = (Body(Robot.load(name)) for name in ("g1", "g1_arms"))
     assert [even(x).free_names[-5:] for x in (body, arms)] == [
         tuple(
             [
@@ -235,7 +235,7 @@ def test_the_book_has_the_stored_jumps():
 @pytest.mark.slow
 def test_held_waists_stay_within_their_motors():
     """Of the published robot, by another way: inverse dynamics of all joints along the exported motion."""
-    for name in ("g1", "g1_arms"):
+    for name in ("g1_legs", "g1_arms"):
         plan = jl.plan(jl.JumpTask(0.4, 0.2), name)
         whole = Whole(plan.robot)
         k = whole.joints.index("waist_pitch_joint")

@@ -290,6 +290,6 @@ def test_a_robot_that_is_heavier_on_one_side_jumps_in_space(bhr):
 def test_the_lines_of_the_book():
     (block,) = re.findall(r"```python\n([^`]*with_limits[^`]*)```", PAGE.read_text(encoding="utf-8"))
     exec(f"import jumplab as jl\n{block}", said := {})
-    robot, g1 = said["robot"], Robot.load("g1")
+    robot, g1 = said["robot"], Robot.load("g1_legs")
     assert robot.stance["knee_rad"] == 0.6 and robot.model.inertias[1].mass == pytest.approx(12.0)
     np.testing.assert_allclose(robot.sagittal.effort[:3], 0.8 * g1.sagittal.effort[:3])

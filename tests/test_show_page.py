@@ -186,7 +186,7 @@ def test_rounded_body_stands_on_the_soles_between_the_joints(bhr):
 
 
 @published
-@pytest.mark.parametrize("name", ["g1", "talos"])
+@pytest.mark.parametrize("name", ["g1_legs", "talos"])
 def test_meshes_of_a_published_robot_lie_where_its_urdf_puts_them(name):
     """Pinocchio places the same meshes by the published URDF: all fill the same space, but for the coarseness."""
     robot = Robot.load(name)
@@ -215,7 +215,7 @@ def test_meshes_of_a_published_robot_lie_where_its_urdf_puts_them(name):
 
 @published
 def test_without_the_files_a_published_robot_is_drawn_from_boxes_and_the_page_says_so(monkeypatch):
-    robot = Robot.load("g1")
+    robot = Robot.load("g1_legs")
     monkeypatch.setattr("jumplab.robot_import.urdf.have_published", lambda: False)
     parts, said = shapes.parts_of(robot)
     assert said == ["drawn from boxes: its meshes are not known on this machine"]

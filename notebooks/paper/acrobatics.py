@@ -32,7 +32,7 @@ from jumplab.task import JumpTask
 from paper import logs
 
 LOG = Path(__file__).with_name("acrobatics.jsonl")
-ROBOT = "g1_23"
+ROBOT = "g1"
 SEED = 42
 KINDS = "ahead", "side", "quarter turn", "half turn", "platform", "flip", "weaker"
 TARGETS = 14, 9, 9, 9, 9  # of the first kinds
