@@ -392,13 +392,16 @@ class SpatialState:
             parts[b.parent] = parts[b.parent][0] + force, parts[b.parent][1] + moment
         return *(self._to_world(x) for x in parts[0]), axial
 
-    def _at_parent(self, k: int, force: ca.SX, moment: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """A (force-like, moment-like) pair of a body at its parent's origin, in its axes; of both
-        sides of an even motion where they meet."""
+    def _at_parent(
+        self, k: int, force: ca.SX, moment: ca.SX, both: bool = True
+    ) -> tuple[ca.SX, ca.SX]:
+        """A (force-like, moment-like) pair of a body at its parent's origin, in its axes; of
+        ``both`` sides of an even motion where they meet."""
         ((_, turn),) = self._turns[k]
         force = turn.out(force)
         moment = turn.out(moment) + cross(self.model.bodies[k].place, force)
-        if (across := self._doubled(k)) is None:
+        across = self._doubled(k)
+        if across is None or not both:
             return force, moment
         return 2 * (force - along(across, force[across])), 2 * along(across, moment[across])
 
@@ -443,22 +446,21 @@ class SpatialState:
         moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
         return force, moment
 
-    def _passed(self, k: int) -> tuple[ca.SX, ca.SX]:
-        """(force, moment) at the origin of its parent, in its axes, that all beyond a joint needs;
-        nothing touches it."""
+    def _passed(self, k: int, both: bool = True) -> tuple[ca.SX, ca.SX]:
+        """(force, moment) at the origin of its parent, in its axes, that all beyond a joint needs,
+        see :meth:`_at_parent`; nothing touches it."""
         force, moment = self._inertial[k]
         for child in self._counted:
             if child and self.model.bodies[child].parent == k:
                 more = self._passed(child)
                 force = force + more[0]
                 moment = moment + more[1]
-        return self._at_parent(k, force, moment)
+        return self._at_parent(k, force, moment, both)
 
     def locked_torque(self, joint: LockedJoint) -> ca.SX:
         """Torque with which a joint that never moves holds its part on the base [N m].
 
-        In an even motion a joint in the middle holds both sides; one beside it holds no limb that
-        moves.
+        In an even motion a joint in the middle holds the limbs of both sides.
         """
         part = joint.part
         first = part.mass * part.lever
@@ -467,7 +469,7 @@ class SpatialState:
         force, moment = self._moved(0, part.mass, first, second)
         for k in self._counted:
             if self.model.bodies[k].name in joint.joints:
-                more = self._passed(k)
+                more = self._passed(k, abs(joint.place[1]) < EXACT_M)
                 force = force + more[0]
                 moment = moment + more[1]
         return ca.dot(ca.DM(joint.axis), moment - cross(ca.DM(joint.place), force))
