@@ -12,6 +12,9 @@ from jumplab.io.motion import Motion
 from jumplab.io.whole import Whole
 from jumplab.models.spatial import SpatialModel, SpatialState
 from jumplab.robot import Robot
+from jumplab.robot.locked import LockedJoint
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.coordinates import even
 
 TASK = jl.JumpTask(0.4, 0.2)
 CHECK = "torque of locked joints"
@@ -57,6 +60,24 @@ def test_they_hold_what_the_published_robot_needs(tmp_path, variant, args):
         needed = held(robot, *(x[0] for x in model.to_pinocchio(*motion[:, None])))
         assert found == pytest.approx([needed[x.name] for x in robot.locked], abs=1e-6)
         assert max(map(abs, found)) > 0.1
+
+
+def test_the_left_half_of_an_even_motion_tells_the_same():
+    """A waist holds both arms, a held collar bone its own; by hand on the default robot."""
+    body = Body(Robot.load())
+    free = even(body)
+    arms = tuple(x for x in body.joint_names if "shoulder" in x)
+    part = pin.Inertia(2.0, np.array([0.02, 0.0, 0.1]), np.diag([0.02, 0.01, 0.02]))
+    waist = LockedJoint("waist", 1.0, np.array([0.0, 0.0, 0.05]), np.array([0.0, 1.0, 0.0]), part, arms)
+    collar = LockedJoint("collar", 1.0, np.array([0.0, 0.1, 0.3]), np.array([0.6, 0.8, 0.0]), part, arms[:1])
+    q, v, a = (ca.SX.sym(x, len(body.model.names)) for x in "qva")
+    both = [SpatialState(body.model, q, v, a, even=half) for half in (False, True)]
+    told = ca.Function("told", [q, v, a], [x.locked_torque(k) for k in (waist, collar) for x in both])
+    rng = np.random.default_rng(5)
+    motion = [free.charts(rng.normal(size=(1, free.size)), level)[0] for level in range(3)]
+    whole_waist, even_waist, whole_collar, even_collar = (float(x) for x in told.call(motion))
+    assert (even_waist, even_collar) == pytest.approx((whole_waist, whole_collar), abs=1e-9)
+    assert min(abs(whole_waist), abs(whole_collar)) > 0.1
 
 
 def test_parts_that_weigh_little_are_no_load(tmp_path):
