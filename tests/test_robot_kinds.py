@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fixtures_robots import refused
 
+from jumplab.io.progress import told_to
 from jumplab.robot.files import files_of
 from jumplab.robot_import import mjcf
 from jumplab.robot_import.checkup import check, examine
@@ -306,6 +307,26 @@ def test_of_many_meshes_those_of_the_feet_are_read(put, monkeypatch):
     path = put(changed(text, ("<freejoint/>", shown)), "a.xml")
     assert "1 of 2 meshes, none of a foot, are not read" in notes(path)
     assert told(path).foot.heel == pytest.approx(-0.07) and mass(path) == pytest.approx(30.8)
+
+
+def test_meshes_of_hands_are_not_read_where_there_are_many(put, monkeypatch):
+    """A finger ends a chain as a foot does; its files are not even looked for."""
+    monkeypatch.setattr(mjcf, "MOST_MESHES", 2)
+    assets = "".join(f'<mesh name="finger {k}" file="lost {k}.stl"/>' for k in range(3))
+    fingers = "".join(f'<geom type="mesh" mesh="finger {k}" mass="0"/>' for k in range(3))
+    hand = '<joint name="left_elbow" axis="0 1 0" range="-2 0"/>'
+    text = changed(MJCF, ("<worldbody>", f"<asset>{assets}</asset><worldbody>"), (hand, hand + fingers))
+    path = put(text, "a.xml")
+    said = notes(path)
+    assert "3 of 3 meshes, none of a foot, are not read" in said and "lost" not in said
+    assert mass(path) == pytest.approx(30.8)
+
+
+def test_what_is_read_is_said_while_it_is_read(put):
+    said = []
+    with told_to(lambda what, done, of: said.append(what)):
+        read_urdf(put(URDF, "hero.urdf"))
+    assert said == ["reading hero.urdf"]
 
 
 def test_a_scene_is_called_after_its_robot(put):

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -37,6 +38,7 @@ LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
 UNNAMED = "MuJoCo Model"
 MOST_MESHES = 30  # of which hulls are made in a second
 MOST_TOES = 2  # joints that hang on a foot
+FOOT_HEIGHT = 0.35  # of a robot's, over its lowest body, up to which a foot may be
 # elements of settings, in which an attribute that another MuJoCo knows is no part of the robot
 SETTINGS = ("option", "flag", "size", "global", "quality", "map", "headlight", "statistic", "key")
 UNKNOWN = re.compile(r"unrecognized attribute: '(\w+)'; Element '(\w+)'")
@@ -147,6 +149,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
     if len(spec.meshes) > MOST_MESHES and not _always_from_geoms(spec):
         _spare_meshes(spec, notes)
     while True:
+        unread = spec.copy()  # what has read its meshes takes seconds to delete some
         try:
             return spec.compile()
         except (ValueError, mujoco.FatalError) as e:
@@ -156,7 +159,9 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
                 raise RobotError(
                     f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
                 ) from e
-            _leave_out(spec, lost, path, notes)
+            files = [mesh.file for mesh in lost]
+            spec = unread
+            _leave_out(spec, [m for m in spec.meshes if m.file in files], path, notes)
 
 
 def _always_from_geoms(spec: mujoco.MjSpec) -> bool:
@@ -170,8 +175,32 @@ def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
     """
     below = {b.name: len(b.find_all("joint")) - len(list(b.joints)) for b in spec.bodies}
     ends = {name for name, joints in below.items() if joints <= MOST_TOES}
+    bare = spec.copy()
+    _as_points(bare, set())
+    with suppress(ValueError, mujoco.FatalError):  # said where the whole is compiled
+        ends -= _high(bare.compile())
+    spared = _as_points(spec, ends)
+    notes.append(f"{len(spared)} of {len(spec.meshes)} meshes, none of a foot, are not read")
+
+
+def _high(model: mujoco.MjModel) -> set[str]:
+    """Names of the bodies that are no feet, by their height with all joints at 0: of hands, each
+    finger ends a chain, with many meshes.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    up = -model.opt.gravity if np.any(model.opt.gravity) else np.array([0.0, 0.0, 1.0])
+    height = data.xpos[1:] @ up
+    high = np.flatnonzero(height > height.min() + FOOT_HEIGHT * np.ptp(height))
+    return {model.body(int(i) + 1).name for i in high} - {""}
+
+
+def _as_points(spec: mujoco.MjSpec, but: Collection[str]) -> list[mujoco.MjsMesh]:
+    """Points instead of massless meshes of all bodies ``but`` some; the meshes that are not read
+    then.
+    """
     for geom in spec.geoms:
-        if geom.meshname and geom.parent.explicitinertial and geom.parent.name not in ends:
+        if geom.meshname and geom.parent.explicitinertial and geom.parent.name not in but:
             geom.type = GEOM.mjGEOM_SPHERE
             geom.meshname = ""
             geom.size = [1e-3, 0.0, 0.0]
@@ -181,7 +210,7 @@ def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
         mesh.file = ""
         mesh.uservert = np.vstack([np.zeros(3), np.eye(3)]).ravel()
         mesh.userface = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
-    notes.append(f"{len(spared)} of {len(spec.meshes)} meshes, none of a foot, are not read")
+    return spared
 
 
 def _pairs_with_others(spec: mujoco.MjSpec, notes: list[str]) -> list[mujoco.MjsPair]:
