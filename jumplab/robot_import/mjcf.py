@@ -316,13 +316,14 @@ def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A closed chain: its equality, the bodies that it ties, and hinges that no spring holds: on
-    the way to the one and to the other.
+    """A closed chain: its equality, the bodies that it ties, hinges that no spring holds, on the
+    way to the one and to the other, and all joints there.
     """
 
     name: str
     ends: tuple[int, int]
     ways: list[list[int]]
+    joints_there: list[list[int]]
 
     @property
     def joints(self) -> list[int]:
@@ -338,9 +339,19 @@ def _loops(model: mujoco.MjModel) -> Iterator[_Loop]:
             if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
                 ends = tuple(int(model.site_bodyid[x]) for x in ends)
             one, two = ({*_up(model, body)} for body in ends)
-            ways = [np.isin(model.jnt_bodyid, [*way]) & hinges for way in (one - two, two - one)]
+            there = [np.isin(model.jnt_bodyid, [*way]) for way in (one - two, two - one)]
+            ways = [np.flatnonzero(way & hinges).tolist() for way in there]
             name = model.equality(e).name or str(e)
-            yield _Loop(name, ends, [np.flatnonzero(way).tolist() for way in ways])
+            yield _Loop(name, ends, ways, [np.flatnonzero(way).tolist() for way in there])
+
+
+def _curves(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
+    """Equalities by which a joint follows another along no line: number, and both joints."""
+    for e in np.flatnonzero((model.eq_type == EQUALITY.mjEQ_JOINT) & model.eq_active0):
+        ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        bent = np.any(model.eq_data[e, 2:5]) or not model.eq_data[e, 1]
+        if ends[1] >= 0 and bent:
+            yield int(e), *ends
 
 
 def _up(model: mujoco.MjModel, body: int) -> Iterator[int]:
@@ -368,6 +379,8 @@ class _Motors:
             on = [self._goes_on(model, end) for end in loop.ends]
             for way, leads in zip(loop.ways, on, strict=True):
                 self.pulled[model.jnt_dofadr[way]] |= leads or not any(on)
+        for _, *ends in _curves(model):  # by a lever that changes
+            self.pulled[model.jnt_dofadr[ends]] = True
         for k in np.flatnonzero(model.jnt_actfrclimited):
             dof = model.jnt_dofadr[k]
             given = self.torque[dof] if self.driven[dof] else [-np.inf, np.inf]
@@ -550,9 +563,20 @@ class _Writer:
             if kind == EQUALITY.mjEQ_JOINT:
                 if one in self.joints:
                     self._follow(name, one, other, model.eq_data[e, :5])
+            elif kind == EQUALITY.mjEQ_TENDON:
+                joints = [k for tendon in (one, other) for k in self._joints_of(tendon)]
+                pulls = f" of the joints {self._joints(joints)}" if joints else ""
+                self.notes.append(f"{name} of tendons{pulls} is left out")
+                self._tie(name, [[k] for k in joints])
             elif kind not in TIES:
-                self.notes.append(f"{name} of tendons or flexes is left out")
+                self.notes.append(f"{name} of flexes is left out")
+        for number, *ends in _curves(model):
+            self._tie(
+                f"the equality {model.equality(number).name or number!r}", [[k] for k in ends]
+            )
         for loop in _loops(model):
+            if set(loop.ends) <= set(self.bodies):
+                self._tie(f"the equality {loop.name!r}", loop.joints_there)
             if set(loop.ends) & set(self.bodies):
                 tied = " to ".join(repr(model.body(x).name) for x in loop.ends)
                 cut = (
@@ -563,13 +587,34 @@ class _Writer:
                 cut = cut if loop.joints else ""
                 self.notes.append(f"the equality {loop.name!r} ties {tied}: left out{cut}")
 
+    def _joints_of(self, tendon: int) -> list[int]:
+        """The joints of this robot that a tendon takes as they are; none of one that winds."""
+        model = self.model
+        if tendon < 0:
+            return []
+        parts = model.tendon_adr[tendon] + np.arange(model.tendon_num[tendon])
+        fixed = parts[model.wrap_type[parts] == WRAP.mjWRAP_JOINT]
+        return [int(k) for k in model.wrap_objid[fixed] if k in self.joints]
+
+    def _tie(self, by: str, ways: list[list[int]]) -> None:
+        """Say which joints may not move each by itself, for :mod:`jumplab.robot_import.lump`."""
+        tie = add(self.xml, "tie", by=by)
+        for way in ways:
+            part = add(tie, "way")
+            for name in (name for k in way for name in self.joints.get(k, [])):
+                add(part, "of", joint=name)
+
     def _follow(self, name: str, one: int, other: int, curve: np.ndarray) -> None:
         """The mimic of a joint that follows another, the one with a motor, along a line."""
         model = self.model
         offset, factor = curve[:2]  # from where both joints count
         named = self._joints(k for k in (one, other) if k >= 0)
         if np.any(curve[2:]) or (other >= 0 and not factor):
-            self.notes.append(f"{name} couples the joints {named} along a curve: left out")
+            self.notes.append(
+                f"{name} couples the joints {named} along a curve: left out, they move as if it "
+                f"were cut; those of a leg without a motor need in [limits] the effort that it "
+                f"gives them"
+            )
             return
         driven = self.motors.driven[model.jnt_dofadr]
         if other >= 0 and driven[one] and not driven[other]:
@@ -590,6 +635,8 @@ class _Writer:
         counted = self._joints(k for k in self.joints if self.ref[k])
         springs = self._joints(k for k in self.joints if model.jnt_stiffness[k])
         tendons = listed(model.tendon(t).name or t for t in range(model.ntendon))
+        pulled = [k for t in range(model.ntendon) for k in self._joints_of(t)]
+        tendons += f" of the joints {self._joints(dict.fromkeys(pulled))}" if pulled else ""
         others = listed(self.motors.others)
         for names, sentence in (
             (counted, "the joints {} count from their ref, as 0"),

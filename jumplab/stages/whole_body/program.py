@@ -204,7 +204,7 @@ class Program(Shown):
             try:
                 solved = self.solve(asked, APART[not held], begin)
             except SolverError:
-                if not held:
+                if not held or self.left_s(asked) <= 0:
                     raise
                 held = False  # where it wandered once it wanders again
                 solved = self.solve(asked, APART[-1], begin)
