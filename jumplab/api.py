@@ -4,7 +4,6 @@ them all.
 
 from __future__ import annotations
 
-import math
 import sys
 import tempfile
 import warnings
@@ -32,6 +31,12 @@ if TYPE_CHECKING:  # what only some of the functions need is imported by them
     from jumplab.sim import Perturbation, Ranges, Scene, SimulationResult
     from jumplab.studies.atlas import Atlas
 
+# processor time [s] for a target, of each start that is compared; and for a schedule, a program of
+# twice the phases, which is solved again with rows for each pair of links that met: hops of the
+# default robot, whose legs pass each other, take 35 s on a busy core
+USUAL_S = 20.0
+SCHEDULE_S = 40.0
+
 
 class Saved(NamedTuple):
     """Content of a result folder."""
@@ -49,7 +54,7 @@ def plan(
     like: Any = None,
     method: str = USUAL,
     robust: Ranges | None = None,
-    patience_s: float = math.inf,
+    patience_s: float | None = None,
     starts: int = 1,
     terms: Mapping[str, Iterable[Term]] | None = None,
     weights: Mapping[str, float] | None = None,
@@ -79,8 +84,9 @@ def plan(
         where stages 1 or 2, or stage 3's tracking, are changed.
     robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``,
         see :mod:`jumplab.studies.robust`.
-    patience_s : processor time after which planning of a target ends, with the best that was
-        found or a refusal [s].
+    patience_s : processor time after which planning ends, with the best that was found or a refusal
+        [s]; an easier target is looked for in what is left of it, and a fifth more. By default 20 a
+        start, and 40 for a schedule or a jump like a clip.
     starts : how many starts are tried to the end, of which the cheapest plan counts; its
         ``attempts`` say how the others differ. See :meth:`jumplab.Planner.plan`.
     terms, weights, off, limits, settings, mesh, atlas : as of :class:`jumplab.Planner`, which plans
@@ -102,7 +108,10 @@ def plan(
         raise InputError(
             "give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)"
         )
-    if contacts is not None or like is not None:
+    along = contacts is not None or like is not None
+    if patience_s is None:
+        patience_s = SCHEDULE_S if along else starts * USUAL_S
+    if along:
         alone = robust is None and method == USUAL and starts == 1
         if not (alone and (contacts is None or like is None)):
             raise InputError(

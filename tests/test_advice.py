@@ -12,7 +12,7 @@ import pytest
 
 import jumplab as jl
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
-from jumplab.ocp.nlp import patience
+from jumplab.ocp.nlp import left_s, patience
 from jumplab.robot_import.urdf import have_published
 from jumplab.studies import advice
 from jumplab.task import JumpTask
@@ -89,10 +89,31 @@ def test_patience_is_a_number_of_seconds(monkeypatch):
     monkeypatch.setattr(advice, "refused", lambda p, t, m: None)
     with pytest.raises(SolverError) as e:
         advice.plan_or_advise(planner, JumpTask(0.2, 0.3), patience_s=1e-9)
-    given_up = "no; planning was given up after 1e-09 s of processor time; ask for a distance of 0.12 m, "
-    assert str(e.value) == f"{given_up}which has a plan"
+    given_up = "no; planning was given up after 1e-09 s of processor time; ask for a distance of 0.12 m "
+    assert str(e.value) == f"{given_up}and a height of 0.18 m, which has a plan"  # far easier: little time is left
     with pytest.raises(InputError, match="patience_s must be a positive number of seconds, got 0"):
         jl.plan(JumpTask(0.2, 0.3), patience_s=0)
+
+
+def test_a_refusal_and_its_advice_share_the_patience(monkeypatch):
+    """By default both end within 25 s: the search after 20, the advice after 24 in all."""
+    planner, left = Fake(), []
+    planner.plan = lambda task, method: left.append(left_s()) or (_ for _ in ()).throw(SolverError("no"))
+    monkeypatch.setattr("jumplab.stages.planner.Planner.plan", lambda self, *a, **k: planner.plan(*a, **k))
+    for asked, most in (({}, 20.0), ({"patience_s": 5.0}, 5.0)):
+        left.clear()
+        with pytest.raises(SolverError, match=r"^no; none of the easier targets that were tried has a plan either"):
+            jl.plan(JumpTask(0.2, 0.3), planner.robot, **asked)
+        assert most - 1 < left[0] <= most
+        assert len(left) > 3 and 1.2 * most - 2 < min(left[1:]) <= max(left[1:]) <= 1.2 * most
+
+
+def test_a_schedule_has_more_patience_by_default(monkeypatch):
+    left = []
+    monkeypatch.setattr("jumplab.stages.planner.Planner.follow", lambda *a, **k: left.append(left_s()) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        jl.plan(contacts="hop=0.2")
+    assert 38 < left[0] <= 40
 
 
 def test_a_solve_ends_when_patience_is_spent(bhr, monkeypatch):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fixtures_robots import refused
 
+from jumplab.io.progress import told_to
 from jumplab.robot.files import files_of
 from jumplab.robot_import import mjcf
 from jumplab.robot_import.checkup import check, examine
@@ -248,6 +249,59 @@ def test_a_knee_that_a_closed_chain_moves_needs_its_effort(put):
     assert check(path, found.text + given).robot.actuators["left_knee"]["effort"] == 120
 
 
+def test_a_knee_moved_along_a_curve_needs_its_effort(put):
+    tie = '<joint joint1="{side}_knee" joint2="{side}_crank" polycoef="0 .5 .3 0 0"/>'
+    path = put(rods(MJCF, CRANK, tie), "a.xml")
+    found = draft(path)
+    assert found.roles.joints["knee"] == ("left_knee", "right_knee")
+    assert "couples the joints 'left_knee', 'left_crank' along a curve: left out, they move as if it" in notes(path)
+    given = TOLD.replace("[limits.knee]", "[limits.knee]\neffort = 120.0")
+    assert check(path, found.text + given).robot.actuators["left_knee"]["effort"] == 120
+
+
+TENDON = '<tendon><fixed name="t"><joint joint="left_knee" coef="1"/><joint joint="{}" coef="1"/></fixed></tendon>'
+PULLED = TENDON + '<equality><tendon tendon1="t"/></equality>'
+TIES = {
+    "joints along a curve": (
+        '<equality><joint joint1="left_knee" joint2="left_hip_pitch" polycoef="0 -2 .5 0 0"/></equality>',
+        "the equality 0 ties the joints 'left_knee', 'left_hip_pitch'",
+    ),
+    "joints by a tendon": (
+        PULLED.format("left_ankle_pitch"),
+        "the equality 0 ties the joints 'left_knee', 'left_ankle_pitch'",
+    ),
+    "a bar across the ankle": (
+        '<equality><connect name="bar" body1="left_knee_link" body2="left_ankle_roll_link" anchor="0 0 0"/></equality>',
+        "the equality 'bar' ties the joints 'left_ankle_pitch', 'left_ankle_roll'",
+    ),
+    "feet to each other": (
+        '<equality><weld name="feet" body1="left_knee_link" body2="right_knee_link"/></equality>',
+        "the equality 'feet' ties the joints 'left_hip_pitch', 'left_hip_roll', 'left_hip_yaw', 'left_knee', "
+        "'right_hip_pitch', 'right_hip_roll' and 2 more",
+    ),
+}
+
+
+@pytest.mark.parametrize(("tie", "sentence"), TIES.values(), ids=TIES.keys())
+def test_joints_of_a_jump_that_cannot_move_each_by_itself_are_refused(put, tie, sentence):
+    path = put(changed(MJCF, ("</worldbody>", f"</worldbody>{tie}")), "a.xml")
+    assert refused(lambda: told(path)) == (
+        f"a.xml: {sentence}, and a jump moves each by itself; take it out of the file, and give each joint the range "
+        f"and the torque that it has in a serial leg in its place"
+    )
+
+
+def test_ties_to_what_does_not_jump_are_only_named(put):
+    """To the world, to a held joint; and a tendon that only pulls."""
+    harness = '<equality><weld name="hook" body1="pelvis" body2="world"/></equality>'
+    path = put(changed(MJCF, ("</worldbody>", f"</worldbody>{harness}")), "a.xml")
+    assert "the equality 'hook' ties 'pelvis' to 'world': left out" in notes(path) and told(path)
+    path = put(changed(MJCF, ("</worldbody>", f"</worldbody>{PULLED.format('left_elbow')}")), "a.xml")
+    assert "the equality 0 of tendons of the joints 'left_knee', 'left_elbow' is left out" in notes(path) and told(path)
+    path = put(changed(MJCF, ("</worldbody>", f"</worldbody>{TENDON.format('left_hip_yaw')}")), "a.xml")
+    assert "the tendons 't' of the joints 'left_knee', 'left_hip_yaw' are left out" in notes(path) and told(path)
+
+
 def test_a_knee_moved_through_a_gear_has_the_motor_of_its_crank(put):
     tie = '<joint joint1="{side}_knee" joint2="{side}_crank" polycoef="0 .5 0 0 0"/>'
     path = put(rods(MJCF, CRANK, tie), "a.xml")
@@ -306,6 +360,26 @@ def test_of_many_meshes_those_of_the_feet_are_read(put, monkeypatch):
     path = put(changed(text, ("<freejoint/>", shown)), "a.xml")
     assert "1 of 2 meshes, none of a foot, are not read" in notes(path)
     assert told(path).foot.heel == pytest.approx(-0.07) and mass(path) == pytest.approx(30.8)
+
+
+def test_meshes_of_hands_are_not_read_where_there_are_many(put, monkeypatch):
+    """A finger ends a chain as a foot does; its files are not even looked for."""
+    monkeypatch.setattr(mjcf, "MOST_MESHES", 2)
+    assets = "".join(f'<mesh name="finger {k}" file="lost {k}.stl"/>' for k in range(3))
+    fingers = "".join(f'<geom type="mesh" mesh="finger {k}" mass="0"/>' for k in range(3))
+    hand = '<joint name="left_elbow" axis="0 1 0" range="-2 0"/>'
+    text = changed(MJCF, ("<worldbody>", f"<asset>{assets}</asset><worldbody>"), (hand, hand + fingers))
+    path = put(text, "a.xml")
+    said = notes(path)
+    assert "3 of 3 meshes, none of a foot, are not read" in said and "lost" not in said
+    assert mass(path) == pytest.approx(30.8)
+
+
+def test_what_is_read_is_said_while_it_is_read(put):
+    said = []
+    with told_to(lambda what, done, of: said.append(what)):
+        read_urdf(put(URDF, "hero.urdf"))
+    assert said == ["reading hero.urdf"]
 
 
 def test_a_scene_is_called_after_its_robot(put):

@@ -1,6 +1,8 @@
 """The line of a cell that takes long: only in an open notebook, and gone when the cell has ended."""
 
 import io
+import threading
+import time
 import types
 
 import pytest
@@ -37,6 +39,23 @@ def test_a_cell_shows_what_is_done_and_leaves_nothing(shell):
     tell("after it")
     assert [line for line in shell.shown if len(line) > 8] == ["done 3 of 7, 0 s", "done 3 of 7, audit, 0 s"]
     assert shell.shown[-1] == ""
+
+
+def test_work_that_says_nothing_for_long_is_shown_all_the_same(shell, monkeypatch):
+    """A solve of half a minute is one call, after a word that came too early to be shown."""
+    before = threading.active_count()
+    monkeypatch.setattr(waiting, "FIRST_S", 0.05)
+    monkeypatch.setattr(waiting, "TICK_S", 0.01)
+    waiting.show_waiting()
+    shell.calls["pre_run_cell"](None)
+    tell("solving")
+    assert not any(shell.shown)
+    until = time.monotonic() + 30
+    while shell.shown.count("solving, 0 s") < 2 and time.monotonic() < until:
+        time.sleep(0.01)
+    shell.calls["post_run_cell"](None)
+    assert shell.shown.count("solving, 0 s") >= 2 and shell.shown[-1] == ""
+    assert threading.active_count() == before
 
 
 def test_a_quick_cell_shows_nothing(shell, monkeypatch):

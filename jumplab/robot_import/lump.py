@@ -107,6 +107,7 @@ def lump(
             f"correct the name"
         )
     moving = _moving_joints(tree, config, roles, trunk, feet)
+    _check_ties(tree, moving)
     held = _held_angles(tree, config, moving)
     model = tree.holding(held, moving)
     pose = link_poses(model)
@@ -175,6 +176,21 @@ def _moving_joints(
                 f"knee and ankle must follow in this order; correct [joints]"
             )
     return list(dict.fromkeys(moving + leg_joints(tree, trunk, feet)))
+
+
+def _check_ties(tree: Tree, moving: Collection[str]) -> None:
+    """Raise if a file ties joints that jump: a chain that is closed by a way of other joints, such
+    as cranks and rods, is only another drive of the leg; one without any decides how the leg moves.
+    """
+    for tie in tree.xml.iterfind("tie"):
+        ways = [[e.get("joint") for e in way] for way in tie]
+        jump = [name for way in ways for name in way if name in moving]
+        if jump and all(not way or {*way} & {*moving} for way in ways):
+            raise tree.error(
+                f"{tie.get('by')} ties the joints {listed(jump)}, and a jump moves each by itself; "
+                f"take it out of the file, and give each joint the range and the torque that it "
+                f"has in a serial leg in its place"
+            )
 
 
 def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str, float]:

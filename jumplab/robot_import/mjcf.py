@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -37,6 +38,7 @@ LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
 UNNAMED = "MuJoCo Model"
 MOST_MESHES = 30  # of which hulls are made in a second
 MOST_TOES = 2  # joints that hang on a foot
+FOOT_HEIGHT = 0.35  # of a robot's, over its lowest body, up to which a foot may be
 # elements of settings, in which an attribute that another MuJoCo knows is no part of the robot
 SETTINGS = ("option", "flag", "size", "global", "quality", "map", "headlight", "statistic", "key")
 UNKNOWN = re.compile(r"unrecognized attribute: '(\w+)'; Element '(\w+)'")
@@ -147,6 +149,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
     if len(spec.meshes) > MOST_MESHES and not _always_from_geoms(spec):
         _spare_meshes(spec, notes)
     while True:
+        unread = spec.copy()  # what has read its meshes takes seconds to delete some
         try:
             return spec.compile()
         except (ValueError, mujoco.FatalError) as e:
@@ -156,7 +159,9 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
                 raise RobotError(
                     f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
                 ) from e
-            _leave_out(spec, lost, path, notes)
+            files = [mesh.file for mesh in lost]
+            spec = unread
+            _leave_out(spec, [m for m in spec.meshes if m.file in files], path, notes)
 
 
 def _always_from_geoms(spec: mujoco.MjSpec) -> bool:
@@ -170,8 +175,32 @@ def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
     """
     below = {b.name: len(b.find_all("joint")) - len(list(b.joints)) for b in spec.bodies}
     ends = {name for name, joints in below.items() if joints <= MOST_TOES}
+    bare = spec.copy()
+    _as_points(bare, set())
+    with suppress(ValueError, mujoco.FatalError):  # said where the whole is compiled
+        ends -= _high(bare.compile())
+    spared = _as_points(spec, ends)
+    notes.append(f"{len(spared)} of {len(spec.meshes)} meshes, none of a foot, are not read")
+
+
+def _high(model: mujoco.MjModel) -> set[str]:
+    """Names of the bodies that are no feet, by their height with all joints at 0: of hands, each
+    finger ends a chain, with many meshes.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    up = -model.opt.gravity if np.any(model.opt.gravity) else np.array([0.0, 0.0, 1.0])
+    height = data.xpos[1:] @ up
+    high = np.flatnonzero(height > height.min() + FOOT_HEIGHT * np.ptp(height))
+    return {model.body(int(i) + 1).name for i in high} - {""}
+
+
+def _as_points(spec: mujoco.MjSpec, but: Collection[str]) -> list[mujoco.MjsMesh]:
+    """Points instead of massless meshes of all bodies ``but`` some; the meshes that are not read
+    then.
+    """
     for geom in spec.geoms:
-        if geom.meshname and geom.parent.explicitinertial and geom.parent.name not in ends:
+        if geom.meshname and geom.parent.explicitinertial and geom.parent.name not in but:
             geom.type = GEOM.mjGEOM_SPHERE
             geom.meshname = ""
             geom.size = [1e-3, 0.0, 0.0]
@@ -181,7 +210,7 @@ def _spare_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
         mesh.file = ""
         mesh.uservert = np.vstack([np.zeros(3), np.eye(3)]).ravel()
         mesh.userface = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
-    notes.append(f"{len(spared)} of {len(spec.meshes)} meshes, none of a foot, are not read")
+    return spared
 
 
 def _pairs_with_others(spec: mujoco.MjSpec, notes: list[str]) -> list[mujoco.MjsPair]:
@@ -287,13 +316,14 @@ def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A closed chain: its equality, the bodies that it ties, and hinges that no spring holds: on
-    the way to the one and to the other.
+    """A closed chain: its equality, the bodies that it ties, hinges that no spring holds, on the
+    way to the one and to the other, and all joints there.
     """
 
     name: str
     ends: tuple[int, int]
     ways: list[list[int]]
+    joints_there: list[list[int]]
 
     @property
     def joints(self) -> list[int]:
@@ -309,9 +339,19 @@ def _loops(model: mujoco.MjModel) -> Iterator[_Loop]:
             if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
                 ends = tuple(int(model.site_bodyid[x]) for x in ends)
             one, two = ({*_up(model, body)} for body in ends)
-            ways = [np.isin(model.jnt_bodyid, [*way]) & hinges for way in (one - two, two - one)]
+            there = [np.isin(model.jnt_bodyid, [*way]) for way in (one - two, two - one)]
+            ways = [np.flatnonzero(way & hinges).tolist() for way in there]
             name = model.equality(e).name or str(e)
-            yield _Loop(name, ends, [np.flatnonzero(way).tolist() for way in ways])
+            yield _Loop(name, ends, ways, [np.flatnonzero(way).tolist() for way in there])
+
+
+def _curves(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
+    """Equalities by which a joint follows another along no line: number, and both joints."""
+    for e in np.flatnonzero((model.eq_type == EQUALITY.mjEQ_JOINT) & model.eq_active0):
+        ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        bent = np.any(model.eq_data[e, 2:5]) or not model.eq_data[e, 1]
+        if ends[1] >= 0 and bent:
+            yield int(e), *ends
 
 
 def _up(model: mujoco.MjModel, body: int) -> Iterator[int]:
@@ -339,6 +379,8 @@ class _Motors:
             on = [self._goes_on(model, end) for end in loop.ends]
             for way, leads in zip(loop.ways, on, strict=True):
                 self.pulled[model.jnt_dofadr[way]] |= leads or not any(on)
+        for _, *ends in _curves(model):  # by a lever that changes
+            self.pulled[model.jnt_dofadr[ends]] = True
         for k in np.flatnonzero(model.jnt_actfrclimited):
             dof = model.jnt_dofadr[k]
             given = self.torque[dof] if self.driven[dof] else [-np.inf, np.inf]
@@ -521,9 +563,20 @@ class _Writer:
             if kind == EQUALITY.mjEQ_JOINT:
                 if one in self.joints:
                     self._follow(name, one, other, model.eq_data[e, :5])
+            elif kind == EQUALITY.mjEQ_TENDON:
+                joints = [k for tendon in (one, other) for k in self._joints_of(tendon)]
+                pulls = f" of the joints {self._joints(joints)}" if joints else ""
+                self.notes.append(f"{name} of tendons{pulls} is left out")
+                self._tie(name, [[k] for k in joints])
             elif kind not in TIES:
-                self.notes.append(f"{name} of tendons or flexes is left out")
+                self.notes.append(f"{name} of flexes is left out")
+        for number, *ends in _curves(model):
+            self._tie(
+                f"the equality {model.equality(number).name or number!r}", [[k] for k in ends]
+            )
         for loop in _loops(model):
+            if set(loop.ends) <= set(self.bodies):
+                self._tie(f"the equality {loop.name!r}", loop.joints_there)
             if set(loop.ends) & set(self.bodies):
                 tied = " to ".join(repr(model.body(x).name) for x in loop.ends)
                 cut = (
@@ -534,13 +587,34 @@ class _Writer:
                 cut = cut if loop.joints else ""
                 self.notes.append(f"the equality {loop.name!r} ties {tied}: left out{cut}")
 
+    def _joints_of(self, tendon: int) -> list[int]:
+        """The joints of this robot that a tendon takes as they are; none of one that winds."""
+        model = self.model
+        if tendon < 0:
+            return []
+        parts = model.tendon_adr[tendon] + np.arange(model.tendon_num[tendon])
+        fixed = parts[model.wrap_type[parts] == WRAP.mjWRAP_JOINT]
+        return [int(k) for k in model.wrap_objid[fixed] if k in self.joints]
+
+    def _tie(self, by: str, ways: list[list[int]]) -> None:
+        """Say which joints may not move each by itself, for :mod:`jumplab.robot_import.lump`."""
+        tie = add(self.xml, "tie", by=by)
+        for way in ways:
+            part = add(tie, "way")
+            for name in (name for k in way for name in self.joints.get(k, [])):
+                add(part, "of", joint=name)
+
     def _follow(self, name: str, one: int, other: int, curve: np.ndarray) -> None:
         """The mimic of a joint that follows another, the one with a motor, along a line."""
         model = self.model
         offset, factor = curve[:2]  # from where both joints count
         named = self._joints(k for k in (one, other) if k >= 0)
         if np.any(curve[2:]) or (other >= 0 and not factor):
-            self.notes.append(f"{name} couples the joints {named} along a curve: left out")
+            self.notes.append(
+                f"{name} couples the joints {named} along a curve: left out, they move as if it "
+                f"were cut; those of a leg without a motor need in [limits] the effort that it "
+                f"gives them"
+            )
             return
         driven = self.motors.driven[model.jnt_dofadr]
         if other >= 0 and driven[one] and not driven[other]:
@@ -561,6 +635,8 @@ class _Writer:
         counted = self._joints(k for k in self.joints if self.ref[k])
         springs = self._joints(k for k in self.joints if model.jnt_stiffness[k])
         tendons = listed(model.tendon(t).name or t for t in range(model.ntendon))
+        pulled = [k for t in range(model.ntendon) for k in self._joints_of(t)]
+        tendons += f" of the joints {self._joints(dict.fromkeys(pulled))}" if pulled else ""
         others = listed(self.motors.others)
         for names, sentence in (
             (counted, "the joints {} have their zero at their ref"),

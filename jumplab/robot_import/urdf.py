@@ -22,6 +22,7 @@ import pinocchio as pin
 
 from jumplab import reading
 from jumplab.errors import RobotError
+from jumplab.io.progress import tell
 from jumplab.robot.changes import MOMENTS
 from jumplab.robot.files import read_text
 from jumplab.robot.sagittal import box_corners
@@ -131,6 +132,7 @@ def read_urdf(path: str | Path) -> str:
     :class:`RobotError` if it is neither.
     """
     text = read_text(Path(path))
+    tell(f"reading {Path(path).name}")
     # URDFs may hold a <mujoco> of settings
     first = re.match(rf"(?:{BEFORE_ROOT})*<([\w:]+)", text, re.DOTALL)
     if first is None or first[1] != "mujoco":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any, TextIO
 
@@ -15,12 +16,16 @@ from jumplab.io.progress import told_to
 # what ends sooner shows nothing; later, the line is kept up to date
 FIRST_S = 1.0
 REDRAW_S = 0.25
+TICK_S = 0.5
 WIDTH = 110  # a longer line would wrap on most terminals
 
 
 @contextlib.contextmanager
 def waiting(out: TextIO, head: str = "") -> Iterator[None]:
-    """Within the block, what long work says of itself is a line of ``out``, gone at the end."""
+    """Within the block, what long work says of itself is a line of ``out``, gone at the end.
+
+    A thread of its own keeps it up to date: a solve, or a robot's meshes, say nothing for long.
+    """
     form = "{desc}, {elapsed_s:.0f} s"
     timing = dict(delay=FIRST_S, mininterval=REDRAW_S, miniters=0)
     count = ""
@@ -34,8 +39,21 @@ def waiting(out: TextIO, head: str = "") -> Iterator[None]:
             bar.set_description_str(head + ", ".join(words), refresh=False)
             bar.update(0)
 
+        ended = threading.Event()
+
+        def keep() -> None:
+            while not ended.wait(TICK_S):
+                if bar.desc:
+                    bar.update(0)
+
+        clock = threading.Thread(target=keep, daemon=True)
         with told_to(hear):
-            yield
+            clock.start()
+            try:
+                yield
+            finally:
+                ended.set()
+                clock.join()
 
 
 def on_terminal(command: str) -> contextlib.AbstractContextManager:

@@ -5,13 +5,14 @@ audit.
 from __future__ import annotations
 
 import math
+import time
 from contextlib import suppress
 from dataclasses import replace
 
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.io.progress import tell
 from jumplab.ocp.cache import remembered
-from jumplab.ocp.nlp import left_s, patience, unexplained
+from jumplab.ocp.nlp import LEAST_S, left_s, patience, unexplained
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
@@ -20,11 +21,11 @@ from jumplab.task import RANGES, JumpTask
 MILDER = 0.6  # of a number that was refused
 BEYOND = 1.4  # times the least distance that a platform takes
 ON_THE_SPOT = 3  # after so many tries a jump on the level that goes nowhere is the next
-# so many easier targets are tried, and none is begun after so long [s of CPU time], or AFTER_S if
-# the patience for the target itself is spent
+# so many easier targets are tried, and none is begun after so long [s of CPU time], or once the
+# patience for the target itself is spent and so many times of it besides: the usual 20 s become 24
 TRIES = 8
 LONGEST_S = 30.0
-AFTER_S = 3.0
+AFTER = 0.2
 THREE_STEPS = ("SRMP", "joint_map")  # where a refusal is none of the method "direct"
 NEAR_RECORD = 0.85  # share of a record, from where on a refusal names it
 LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
@@ -40,17 +41,20 @@ def plan_or_advise(
     """The plan of a target, as :meth:`jumplab.Planner.plan` (by ``method``, of the cheapest of
     ``starts``); a refusal ends with an easier target that has a plan.
 
-    Planning ends after ``patience_s`` of processor time [s]. Looking for another target takes some
-    seconds more, so studies of many targets leave it out.
+    Planning ends after ``patience_s`` of processor time [s]. Looking for another target takes what
+    is left of it, and at most a fifth more, so studies of many targets leave it out.
     """
+    began = time.process_time()
     with patience(patience_s):
         try:
             more = {} if starts == 1 else {"starts": starts}
             return planner.plan(task, method, **more)
         except (InfeasibleError, SolverError) as e:
             refusal = e
-            spent = left_s() <= 0
-    raise advised(refusal, planner, task, method, patience_s if spent else None) from refusal
+            spent_s = patience_s if left_s() <= 0 else None
+    longest = (1 + AFTER) * patience_s - (time.process_time() - began)
+    with patience(max(min(longest, LONGEST_S), LEAST_S)):
+        raise advised(refusal, planner, task, method, spent_s) from refusal
 
 
 def advised(
@@ -66,8 +70,9 @@ def advised(
     Each target that is tried is milder than the one before, in one of its numbers. ``spent_s`` is
     the processor time [s] after which planning was given up, if it was.
     """
-    with unexplained(), patience(LONGEST_S if spent_s is None else AFTER_S):
-        advice = _advice(refusal, planner, task, method)
+    with unexplained():
+        # little time is left for a jump then, which should not be one of the hard ones again
+        advice = _advice(refusal, planner, task, method, steps=1 if spent_s is None else 2)
     if spent_s is not None:
         advice = f"planning was given up after {spent_s:g} s of processor time; {advice}"
     said = "; ".join([str(refusal), *_records_near(planner.robot, task), advice])
@@ -102,16 +107,22 @@ def _records_near(robot: Robot, task: JumpTask) -> list[str]:
     return said
 
 
-def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str) -> str:
+def _advice(
+    refusal: JumplabError, planner: Planner, task: JumpTask, method: str, steps: int
+) -> str:
     # stage 1's limits are not the robot's
     by_steps = method == "three-step" or getattr(refusal, "stage", "") in THREE_STEPS
     if by_steps and refused(planner, task, "direct") is None:
         return "ask for the method 'direct', which has a plan"
     easier = task
     tried = []
-    for number in range(TRIES):
-        easier = _easier(easier, refusal, number)
-        if easier is None or left_s() <= 0:
+    number = 0
+    while number < TRIES:
+        last = easier
+        for _ in range(steps):
+            easier = _easier(easier, refusal, number) or easier
+            number += 1
+        if easier == last or left_s() <= 0:
             break
         tried.append(words(task, easier))
         tell(f"refused; trying {tried[-1]}")

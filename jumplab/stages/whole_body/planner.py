@@ -47,6 +47,8 @@ from jumplab.task import JumpTask
 
 EXPLAINING = 30  # iterations of the search before its failure is explained
 BROKEN = 1.5  # times a limit between the nodes, beyond which a motion is none
+# and beyond which, settled, it is another motion on a finer mesh, if any: a new start is worth more
+HOPELESS = 10.0
 # with more than that to turn only the exact Hessian settles, so it is tried first
 HELD_TURN_RAD = np.radians(100)
 
@@ -283,7 +285,8 @@ class WholeBodyPlanner:
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
         # what is followed is settled
         for further in REFINED[program.follows :]:
-            if best.used <= 1 or program.spent(asked):
+            hopeless = further is not SETTLED and best.used > HOPELESS
+            if best.used <= 1 or hopeless or program.spent(asked):
                 break
             program = program if further is SETTLED else program.finer
             try:

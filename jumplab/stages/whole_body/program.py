@@ -194,6 +194,7 @@ class Program(Shown):
         times).
         """
         solved = self.solve(asked, start)
+        held = start.held
         for _ in range(ROUNDS):
             begin = from_solved(self, solved)
             rows = merged(begin.apart, self._met(solved))
@@ -201,10 +202,11 @@ class Program(Shown):
                 break
             begin = replace(begin, apart=rows)
             try:
-                solved = self.solve(asked, APART[not start.held], begin)
+                solved = self.solve(asked, APART[not held], begin)
             except SolverError:
-                if not start.held:
+                if not held or self.left_s(asked) <= 0:
                     raise
+                held = False  # where it wandered once it wanders again
                 solved = self.solve(asked, APART[-1], begin)
         return solved
 
