@@ -36,6 +36,7 @@ if TYPE_CHECKING:  # what only some of the functions need is imported by them
 # default robot, whose legs pass each other, take 35 s on a busy core
 USUAL_S = 20.0
 SCHEDULE_S = 40.0
+ROBUST_S = 120.0  # the trees of a dozen robots take up to a minute to build
 
 
 class Saved(NamedTuple):
@@ -86,7 +87,7 @@ def plan(
         see :mod:`jumplab.studies.robust`.
     patience_s : processor time after which planning ends, with the best that was found or a refusal
         [s]; an easier target is looked for in what is left of it, and a fifth more. By default 20 a
-        start, and 40 for a schedule or a jump like a clip.
+        start, 40 for a schedule or a jump like a clip, and 120 for a robust plan.
     starts : how many starts are tried to the end, of which the cheapest plan counts; its
         ``attempts`` say how the others differ. See :meth:`jumplab.Planner.plan`.
     terms, weights, off, limits, settings, mesh, atlas : as of :class:`jumplab.Planner`, which plans
@@ -110,7 +111,8 @@ def plan(
         )
     along = contacts is not None or like is not None
     if patience_s is None:
-        patience_s = SCHEDULE_S if along else starts * USUAL_S
+        once = ROBUST_S if robust is not None else USUAL_S
+        patience_s = SCHEDULE_S if along else starts * once
     if along:
         alone = robust is None and method == USUAL and starts == 1
         if not (alone and (contacts is None or like is None)):
