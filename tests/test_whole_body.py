@@ -5,10 +5,11 @@ import pinocchio as pin
 import pytest
 from fixtures_core import LIMBS, jump, pendulum, planner, replay
 
+import jumplab as jl
 from jumplab.auditing import audit
 from jumplab.errors import InputError, SolverError
 from jumplab.ocp import Nlp
-from jumplab.ocp.nlp import GOOD_STATUSES
+from jumplab.ocp.nlp import GOOD_STATUSES, OUT_OF_TIME
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.whole_body import Limits, Mesh, Weights, WholeBodyPlanner, motions
@@ -66,6 +67,29 @@ def test_it_begins_with_what_is_given(run):
     assert (body.attempts[0].start, body.attempts[0].hessian) == (first.name, words)
     assert body.start == first.name
     assert all(x.status not in GOOD_STATUSES for x in body.attempts[:-1])
+
+
+def test_time_that_other_threads_spent_is_not_its_own(monkeypatch):
+    """Ipopt counts that of the process: over, it begins again; the plan is the same, and one attempt."""
+    task, solve, with_options = JumpTask(0.4, 0.3), Nlp.solve, Nlp.with_options
+    limits = []
+
+    def optioned(nlp, options, hold=None):
+        limits.append(options["max_cpu_time"])
+        return with_options(nlp, options, hold)
+
+    def late(nlp, **given):
+        if len(limits) < 3:
+            raise SolverError("no time", status=OUT_OF_TIME, iterations=1)
+        return solve(nlp, **given)
+
+    alone = jl.plan(task)
+    monkeypatch.setattr(Nlp, "with_options", optioned)
+    monkeypatch.setattr(Nlp, "solve", late)
+    plan = jl.plan(task)
+    assert [x.status for x in plan.attempts] == [x.status for x in alone.attempts]
+    np.testing.assert_array_equal(plan.tape.q, alone.tape.q)
+    assert [x / limits[0] for x in limits[:3]] == pytest.approx([1.0, 2.0, 4.0])
 
 
 def test_its_audit_is_clean(run):

@@ -28,9 +28,11 @@ from jumplab.ocp.solution import Multipliers, PhaseGuess, Solution, Statistics
 
 # off where nobody reads why there is no plan
 EXPLAINED: ContextVar[bool] = ContextVar("explained", default=True)
-# processor time of this process [s] at which a search ends with the best that it has
+# processor time of this thread [s] at which a search ends with the best that it has; that of the
+# process is spent by its other threads as well
 DEADLINE: ContextVar[float] = ContextVar("deadline", default=math.inf)
 LEAST_S = 1.0  # that a solve gets all the same
+OUT_OF_TIME = "Maximum_CpuTime_Exceeded"
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # scaled row error above which a "solved" status is not believed
 IPOPT = {
@@ -76,7 +78,7 @@ def patience(seconds: float) -> Iterator[None]:
     """
     if not seconds > 0:
         raise InputError(f"patience_s must be a positive number of seconds, got {seconds!r}")
-    outside = DEADLINE.set(time.process_time() + seconds)
+    outside = DEADLINE.set(time.thread_time() + seconds)
     try:
         yield
     finally:
@@ -85,7 +87,7 @@ def patience(seconds: float) -> Iterator[None]:
 
 def left_s() -> float:
     """Processor time [s] that a search may still take."""
-    return DEADLINE.get() - time.process_time()
+    return DEADLINE.get() - time.thread_time()
 
 
 class Nlp:

@@ -44,7 +44,7 @@ def plan_or_advise(
     Planning ends after ``patience_s`` of processor time [s]. Looking for another target takes what
     is left of it, and at most a fifth more, so studies of many targets leave it out.
     """
-    began = time.process_time()
+    began = time.thread_time()
     with patience(patience_s):
         try:
             more = {} if starts == 1 else {"starts": starts}
@@ -52,7 +52,7 @@ def plan_or_advise(
         except (InfeasibleError, SolverError) as e:
             refusal = e
             spent_s = patience_s if left_s() <= 0 else None
-    longest = (1 + AFTER) * patience_s - (time.process_time() - began)
+    longest = (1 + AFTER) * patience_s - (time.thread_time() - began)
     with patience(max(min(longest, LONGEST_S), LEAST_S)):
         raise advised(refusal, planner, task, method, spent_s) from refusal
 

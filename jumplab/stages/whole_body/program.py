@@ -15,7 +15,7 @@ import numpy as np
 
 from jumplab.errors import Shown, SolverError
 from jumplab.ocp.assembly import Assembled
-from jumplab.ocp.nlp import LEAST_S, Nlp, Solution, left_s
+from jumplab.ocp.nlp import LEAST_S, OUT_OF_TIME, Nlp, Solution, left_s
 from jumplab.ocp.posing import Posed, binding, lagrangian, pack, pose
 from jumplab.ocp.problem import Problem
 from jumplab.ocp.solution import PhaseSolution, resampled
@@ -53,6 +53,7 @@ FINER = 1.5  # times as many intervals, where a motion passes limits between the
 # tried; on a busy core a hop, which has to be solved on a finer mesh with its links apart, takes 20
 # to 40 s
 PATIENCE_S = 60.0
+OWN_SHARE = 0.8  # of a limit that is over: less of a thread's own time, and others spent the rest
 USUAL_SIZE = 4500  # variables, up to which that holds; larger programs have more time
 # [s] an iteration in a program of that size may take on average, three times as long as on a quiet
 # core
@@ -171,23 +172,40 @@ class Program(Shown):
         built = self._nlp(begin.apart)
         most = start.patience * ITERATION_S * self.size / USUAL_SIZE
         left = max(LEAST_S, min(most, self.left_s(asked)))
-        limit = {"max_iter": start.patience, "max_cpu_time": left}
-        options = {**IPOPT, **start.options, **limit, **self.options}
-        nlp = built.with_options(options, HOLD if start.held else None)
-        numbers = self._numbers(asked, nlp.problem)
+        numbers = self._numbers(asked, built.problem)
         known = {name: numbers["parameters"][name] for name in self.sought}
         guess = {k: replace(x, constants=known | x.constants) for k, x in begin.guess.items()}
-        began = time.process_time()
+        given = dict(guess=guess, **numbers, multipliers=begin.multipliers, explain=explain)
+        began = time.thread_time()
         try:
-            solution = nlp.solve(
-                guess=guess, **numbers, multipliers=begin.multipliers, explain=explain
-            )
+            solution = self._in_time(built, start, left, given)
         except SolverError as e:
-            asked.note(start, e.iterations, e.status, time.process_time() - began)
+            asked.note(start, e.iterations, e.status, time.thread_time() - began)
             raise
         done = solution.statistics
-        asked.note(start, done.iterations, done.status, time.process_time() - began)
+        asked.note(start, done.iterations, done.status, time.thread_time() - began)
         return Solved(self.schedule(begin.apart), solution)
+
+    def _in_time(
+        self, built: Nlp, start: Start, most_s: float, given: Mapping[str, Any]
+    ) -> Solution:
+        """One solve of at most ``most_s`` of this thread's processor time [s].
+
+        Ipopt counts that of the process: where other threads spent it, it begins again with more,
+        so that a plan does not depend on them.
+        """
+        limit_s = most_s
+        while True:
+            began = time.thread_time()
+            limit = {"max_iter": start.patience, "max_cpu_time": limit_s}
+            options = {**IPOPT, **start.options, **limit, **self.options}
+            try:
+                return built.with_options(options, HOLD if start.held else None).solve(**given)
+            except SolverError as e:
+                own_s = time.thread_time() - began
+                if e.status != OUT_OF_TIME or own_s > OWN_SHARE * most_s:
+                    raise
+                limit_s *= 2
 
     def solve_apart(self, asked: Asked, start: Start) -> Solved:
         """The same, solved on with rows for whatever links meet in it (at most :data:`ROUNDS`
