@@ -137,7 +137,7 @@ def test_a_motor_on_a_tendon_is_not_that_of_the_joint_of_its_number(put):
     tendon = '<tendon><fixed name="t"><joint joint="left_elbow" coef="1"/></fixed></tendon>'
     path = put(changed(MJCF, ("</actuator>", f"{motors}</actuator>{tendon}")), "a.xml")
     assert limit(path, "left_knee") == 160 and limit(path, "left_elbow") == 30
-    assert "the tendons 't' are left out" in notes(path) and "act on no joint" in notes(path)
+    assert "the tendons 't' of the joints 'left_elbow' are left out" in notes(path) and "act on no joint" in notes(path)
 
 
 @pytest.mark.parametrize("base", ["", '<joint name="root" type="free"/>', "planar"])
