@@ -18,6 +18,7 @@ from jumplab.robot_import import mjcf
 from jumplab.robot_import.checkup import check, examine
 from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import Tree, parse, read_urdf
+from jumplab.stages.whole_body.body import Body
 
 HERE = Path(__file__).parent
 URDF = (HERE / "mini.urdf").read_text()
@@ -136,7 +137,7 @@ def test_a_motor_on_a_tendon_is_not_that_of_the_joint_of_its_number(put):
     tendon = '<tendon><fixed name="t"><joint joint="left_elbow" coef="1"/></fixed></tendon>'
     path = put(changed(MJCF, ("</actuator>", f"{motors}</actuator>{tendon}")), "a.xml")
     assert limit(path, "left_knee") == 160 and limit(path, "left_elbow") == 30
-    assert "the tendons 't' are left out" in notes(path) and "act on no joint" in notes(path)
+    assert "the tendons 't' of the joints 'left_elbow' are left out" in notes(path) and "act on no joint" in notes(path)
 
 
 @pytest.mark.parametrize("base", ["", '<joint name="root" type="free"/>', "planar"])
@@ -322,6 +323,34 @@ def test_a_knee_moved_through_a_gear_has_the_motor_of_its_crank(put):
         text = changed(text, (limits[0], mimic), ("</robot>", crank.format(side)))
     knee = examine(put(text)).robot.actuators["left_knee"]
     assert (knee["effort"], knee["speed"], knee["friction"]) == pytest.approx((40, 13.5, 2 / 3))
+
+
+@pytest.mark.parametrize("upper", [True, False])
+def test_a_knee_of_two_joints_has_its_boxes_above_and_below_both(put, upper):
+    """One that rolls on another, whichever of both is taken for the knee."""
+    text = URDF
+    for side in ("left", "right"):
+        shin = f'<link name="{side}_shin"><inertial><origin xyz="0 0 -.1"/><mass value="1"/><inertia ixx=".01" '
+        shin += f'iyy=".01" izz=".002" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="{side}_low" '
+        shin += f'type="revolute"><parent link="{side}_knee_link"/><child link="{side}_shin"/>'
+        shin += '<origin xyz="0 0 -.05"/><axis xyz="0 1 0"/>'
+        shin += '<limit lower="0" upper="1.5" effort="160" velocity="20"/></joint></robot>'
+        ankle = f'<parent link="{side}_knee_link"/><child link="{side}_ankle_pitch_link"/><origin xyz="0 0 -0.31"/>'
+        below = ankle.replace("knee_link", "shin").replace("-0.31", "-0.26")
+        text = changed(text, ("</robot>", shin), (ankle, below))
+    path = put(text)
+    given = draft(path).text
+    if not upper:
+        given = changed(given, ('"left_knee", "right_knee"', '"left_low", "right_low"'))
+    robot = check(path, given).robot
+    links = {link.get("name"): link for link in parse(robot.urdf, "x").iter("link")}
+    long = {name for name in links if links[name].find("collision") is not None and name.startswith("left")}
+    assert long == {"left_hip_yaw_link", "left_shin", "left_ankle_roll_link", "left_arm_link"}
+    thigh, shin = (links[f"left_{name}"].find("collision/origin").get("xyz") for name in ("hip_yaw_link", "shin"))
+    assert [float(x.split()[2]) for x in (thigh, shin)] == pytest.approx([-0.155 if upper else -0.18, -0.13])
+    body = Body(robot)
+    names = [body.joint_names[k - 1] for k, _ in (*body.shank_points, *body.limb_points[:2])]
+    assert set(names) == {"left_low", "right_low"}
 
 
 def test_losses_of_the_file_are_those_of_the_motors(put):

@@ -29,7 +29,7 @@ from jumplab.robot.files import (
     roles_table,
     table,
 )
-from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, Body, Lumped, RoleJoints, lump
+from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, SAME, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
 from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
 from jumplab.robot_import.write import (
@@ -165,8 +165,9 @@ def _sole(tree: Tree, config: dict, offset: np.ndarray) -> dict[str, float]:
 def _cut_hips(lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> None:
     """Cut hip ranges to where boxes of thigh and trunk meet; canted hips keep theirs."""
     cut = 0.0
-    for hip, knee in zip(*(lumped.moved_by(roles[role]) for role in LEG[:2]), strict=True):
-        thigh = lumped.bodies[knee.parent]
+    for leg in zip(*(lumped.moved_by(roles[role]) for role in LEG), strict=True):
+        hip, *_ = leg
+        thigh, _ = _thigh_and_shank(lumped, *leg)
         trunk = _solids(lumped.trunk, boxes, hip, 0.0)
         for end in ("lower", "upper") if abs(hip.axis[1]) == 1 else ():
             last = hip.limits[end]
@@ -315,10 +316,10 @@ def _boxes(
     long = sole["toe"] - sole["heel"]
     centre = np.array([(sole["toe"] + sole["heel"]) / 2, 0.0, sole["z"] + width["foot"] / 2])
     for hip, knee, ankle in legs:
-        thigh = lumped.bodies[knee.parent]
+        thigh, shank = _thigh_and_shank(lumped, hip, knee, ankle)
         foot = [ankle, *lumped.beyond(ankle)][-1]
         out[thigh.name] = _limb(thigh, hip.place, knee.place, width["thigh"])
-        out[knee.name] = _limb(knee, knee.place, ankle.place, width["shank"])
+        out[shank.name] = _limb(shank, shank.place, ankle.place, width["shank"])
         out[foot.name] = [(centre, np.array([long, 2 * sole["half"], width["foot"]]))]
         while foot.parent:
             foot = lumped.bodies[foot.parent]
@@ -326,6 +327,25 @@ def _boxes(
     out |= _given_boxes(config, set(lumped.bodies))
     arms = {b.name: _arm(lumped, b, width["arm"]) for b in lumped.bodies.values()}
     return arms | out
+
+
+def _thigh_and_shank(lumped: Lumped, hip: Body, knee: Body, ankle: Body) -> tuple[Body, Body]:
+    """The bodies of a leg that have its two long boxes: of a knee of two joints, such as one that
+    rolls, neither is the short link between them.
+    """
+    thigh = lumped.bodies[knee.parent]
+    while thigh is not hip and _bends(thigh, knee, hip):
+        thigh = lumped.bodies[thigh.parent]
+    shank = lumped.bodies[ankle.parent]
+    while shank is not knee and not _bends(shank, knee, ankle):
+        shank = lumped.bodies[shank.parent]
+    return thigh, shank
+
+
+def _bends(body: Body, knee: Body, end: Body) -> bool:
+    """Whether a joint turns as a knee does, nearer to it than to the other ``end`` of its limb."""
+    far = np.linalg.norm(body.place - end.place)
+    return abs(body.axis @ knee.axis) > SAME and np.linalg.norm(body.place - knee.place) < far
 
 
 def _given_boxes(config: dict, links: set[str]) -> dict[str, Boxes]:

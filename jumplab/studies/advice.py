@@ -119,9 +119,10 @@ def _advice(
     number = 0
     while number < TRIES:
         last = easier
-        for _ in range(steps):
-            easier = _easier(easier, refusal, number) or easier
-            number += 1
+        for step in range(steps):
+            # a lower jump onto a platform is no easier one
+            easier = _easier(easier, refusal, number + step * (not task.platform_m)) or easier
+        number += steps
         if easier == last or left_s() <= 0:
             break
         tried.append(words(task, easier))

@@ -179,8 +179,21 @@ class Body:
         ]
 
     @cached_property
+    def _shins(self) -> list[int]:
+        """The bodies of both shanks: that of the knee, or of a second joint of it, if it has a
+        shape.
+        """
+        shaped = {x.body for x in self.shapes}
+        out = []
+        for foot, (k, _, _) in zip(self.feet, self.knees, strict=True):
+            up = self.chain(foot)
+            below = up[1 : up.index(1 + k)]
+            out.append(next((body for body in below if body in shaped), 1 + k))
+        return out
+
+    @cached_property
     def _shanks(self) -> list[tuple[Box, np.ndarray]]:
-        return self._shapes_of({1 + k for k, _, _ in self.knees})
+        return self._shapes_of({*self._shins})
 
     @cached_property
     def shank_m(self) -> float:
@@ -199,7 +212,7 @@ class Body:
     @cached_property
     def limb_points(self) -> list[Spot]:
         """Knees, and the far ends of the bodies that end a limb but are no feet."""
-        points = [(1 + k, np.zeros(3)) for k, _, _ in self.knees]
+        points = [(body, np.zeros(3)) for body in self._shins]
         ends = set(range(len(self.model.bodies))) - {b.parent for b in self.model.bodies}
         for box, way in self._shapes_of(ends - set(self.feet)):
             points.append((box.body, box.centre + (way if way @ box.centre > 0 else -way)))
