@@ -217,12 +217,12 @@ def make_clips(
         try:
             for row in in_parallel(work, jobs, "generator"):
                 rows[row["passed"]].append(row)
-                words = "passed" if row["passed"] else f"left out, {row['reasons'][0]}"
-                say(f"{row['name']}: {words}")
                 store.settle()
                 store.write_file(out / INDEX, store.to_json(head | library).encode())
                 if page:
                     store.write_file(out / PAGE, page(head | library).encode())
+                words = "passed" if row["passed"] else f"left out, {row['reasons'][0]}"
+                say(f"{row['name']}: {words}")
         finally:
             shutil.rmtree(out / STAGING, ignore_errors=True)
     return library
