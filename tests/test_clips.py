@@ -132,6 +132,7 @@ def test_what_passes_is_exported_and_the_rest_is_left_out_with_its_reason(world,
     assert row["target"]["distance_m"] == clips.targets()["forward-1"].of(Robot.load()).distance_m
     assert row["measured"][DEFAULT_ENGINE]["foot_distance_m"] == 0.6 and set(row["measured"]) == set(ENGINES)
     assert out["reasons"] == ["the knee is too slow"] and not out["passed"] and "file" not in out
+    assert (row["planned"], out["planned"]) == (True, False)
     assert (row["split"], out["split"]) == ("training", "held-out") and index["targets"] == 2
     assert row["picture"] == "forward-1/strip.png"
     assert (tmp_path / "lib" / row["picture"]).read_bytes().startswith(b"\x89PNG")

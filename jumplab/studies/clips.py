@@ -70,7 +70,7 @@ are under the licence that it has there.
 
 @dataclass(frozen=True)
 class Target:
-    """What one clip of a library shall show, before a robot is known; numbers as in ``clips.toml``.
+    """Target of one clip of a library, before a robot is known; numbers as in ``clips.toml``.
 
     Attributes
     ----------
@@ -284,7 +284,7 @@ def _judged(planner: Planner, task: JumpTask | Contacts, folder: Path) -> Plain:
     try:
         plan = planner.plan(task) if isinstance(task, JumpTask) else planner.follow(task)
     except JumplabError as e:
-        return {"passed": False, "reasons": [str(e)], "measured": {}}
+        return {"planned": False, "passed": False, "reasons": [str(e)], "measured": {}}
     report = store.write_plan(folder, plan.tape, plan.robot, plan.summary, complete=write_audit)
     scene = Scene.of_plan(plan.summary, plan.robot)
     trials = {}
@@ -305,4 +305,5 @@ def _judged(planner: Planner, task: JumpTask | Contacts, folder: Path) -> Plain:
         if trial.metrics is not None
     }
     checks = len(report.checks)
-    return {"passed": not reasons, "reasons": reasons, "measured": measured, "audit": checks}
+    found = {"planned": True, "passed": not reasons, "reasons": reasons}
+    return found | {"measured": measured, "audit": checks}
