@@ -58,6 +58,9 @@ USUAL_SIZE = 4500  # variables, up to which that holds; larger programs have mor
 # core
 ITERATION_S = 0.12
 RISING_S = 0.06  # in which a foot that follows a motion rises or comes down by its clearance
+# a motion that is followed begins beyond many limits: from further inside them all its first steps
+# are longer, and it ends in the same place
+INSIDE = dict.fromkeys(("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac"), 0.1)
 ROUNDS = 4  # of rows for links that met
 BUILT = 8  # programs with such rows that are kept
 
@@ -172,7 +175,8 @@ class Program(Shown):
         most = start.patience * ITERATION_S * self.size / USUAL_SIZE
         left = max(LEAST_S, min(most, self.left_s(asked)))
         limit = {"max_iter": start.patience, "max_cpu_time": left}
-        options = {**IPOPT, **start.options, **limit, **self.options}
+        inside = INSIDE if self.follows else {}
+        options = {**IPOPT, **inside, **start.options, **limit, **self.options}
         nlp = built.with_options(options, HOLD if start.held else None)
         numbers = self._numbers(asked, nlp.problem)
         known = {name: numbers["parameters"][name] for name in self.sought}
