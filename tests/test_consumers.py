@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jumplab.errors import InputError
 from jumplab.io import export
+from jumplab.io import folder as store
 from jumplab.io.clip import read_clips
 from jumplab.io.motion import Motion
 from jumplab.io.tensors import read_tensors, tensor_file
@@ -141,6 +142,7 @@ def test_the_surface_on_which_a_motion_ends_goes_with_it(way, top, bhr, tmp_path
     if top is None:
         assert "platform" not in [model.geom(k).name for k in range(model.ngeom)]
         assert not [name for x in arrays for name in x.files if name.startswith("object")]
+        assert not [*tmp_path.glob("*.obj")]
         return
     box = model.geom("platform")
     assert box.pos[2] + box.size[2] == pytest.approx(max(top, 0), abs=1e-6)
@@ -153,3 +155,29 @@ def test_the_surface_on_which_a_motion_ends_goes_with_it(way, top, bhr, tmp_path
     for x in arrays:
         assert x["object_pos_w"][-1] == pytest.approx(box.pos, abs=1e-6) and x["object_quat_w"].shape == (12, 4)
         assert not x["object_lin_vel_w"].any() and not x["object_ang_vel_w"].any()
+    for file, x in zip(files, arrays, strict=True):
+        points, faces = mesh_of(file.with_name(f"{file.stem}_platform.obj"))
+        assert np.abs(points).max(axis=0) == pytest.approx(box.size, rel=1e-6)
+        places = Rotation.from_quat(np.roll(x["object_quat_w"][0], -1)).apply(points) + x["object_pos_w"][0]
+        assert (places[:, 2].min(), places[:, 2].max()) == pytest.approx((min(top, 0), max(top, 0)), abs=1e-6)
+        a, b, c, _ = points[faces].transpose(1, 0, 2)
+        normals = np.cross(b - a, c - a)
+        middles = points[faces].mean(axis=1)
+        assert ((normals * middles).sum(axis=1) > 0).all()  # outside is outside
+        assert (normals * middles).sum() / 3 == pytest.approx(8 * np.prod(box.size))  # its volume
+    level = Motion(motion.t, np.tile(q[:1], (12, 1)), none, none[:, 6:], motion.phase, "plan")
+    export.write("unilab-npz", level, bhr, files[0])
+    assert [file.name for file in tmp_path.glob("*.obj")] == ["holosoma-npz_platform.obj"]
+
+
+def mesh_of(path):
+    """Points (n, 3) and four-cornered faces (m, 4) of an OBJ file."""
+    rows = [line.split() for line in path.read_text().splitlines()]
+    points = np.array([row[1:] for row in rows if row[0] == "v"], float)
+    return points, np.array([row[1:] for row in rows if row[0] == "f"], int) - 1
+
+
+def test_the_mesh_of_a_platform_goes_with_the_plan_that_it_was_made_for(tmp_path):
+    for name in ("unilab_platform.obj", "simulated_holosoma_platform.obj"):
+        assert name in store.OF_PLAN
+    assert "simulated_unilab_platform.obj" in store.OF_SIMULATION

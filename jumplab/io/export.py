@@ -18,7 +18,7 @@ from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.io import gains
 from jumplab.io.columns import table_of
-from jumplab.io.folder import FORMATS, transaction, write_file
+from jumplab.io.folder import FORMATS, MESH, WITH_OBJECT, transaction, write_file
 from jumplab.io.motion import Motion, checked_rate
 from jumplab.io.tensors import tensor_file
 from jumplab.io.whole import ORDERS, Whole, axes_of, ordered
@@ -50,8 +50,9 @@ def write(
     """Write a motion of the whole robot in one of :data:`FORMATS` to a file, or to a folder.
 
     ``fps`` are frames a second [1/s], by default those of the format; the motion's end follows,
-    where it is none of them. Raises :class:`InputError`, and leaves nothing behind, if the format
-    is unknown, the rate cannot be meant, or the path cannot be written.
+    where it is none of them. Beside a file that has an object, the object's mesh is written
+    (``..._platform.obj``). Raises :class:`InputError`, and leaves nothing behind, if the format is
+    unknown, the rate cannot be meant, or the path cannot be written.
     """
     path = Path(path)
     rate = rate_of(format_name, fps)
@@ -59,10 +60,13 @@ def write(
     if ending and path.suffix.lower() != ending:
         raise InputError(f"--out must name a file that ends in {ending}, got {str(path)!r}")
     whole = Whole(robot)
-    content = CONTENTS[format_name](whole, whole.frames(motion, rate), rate)
+    frames = whole.frames(motion, rate)
+    content = CONTENTS[format_name](whole, frames, rate)
     if format_name in LIBRARIES:
         content = {path.stem: content}  # readers of folders look there
     if ending:
+        if format_name in WITH_OBJECT:
+            _write_mesh(path.with_name(path.stem + MESH), whole.block(frames))
         return write_file(path, _encoded(ending, content))
     known = (*content, ".staging", ".commit")  # the last two are left by a writer that was killed
     strangers = [p.name for p in path.iterdir() if p.name not in known] if path.is_dir() else []
@@ -75,6 +79,24 @@ def write(
         for name, part in content.items():
             (staging / name).write_bytes(_encoded(Path(name).suffix, part))
     return path
+
+
+def _write_mesh(path: Path, block: tuple[np.ndarray, np.ndarray, float] | None) -> None:
+    """Write a block (see :meth:`.Whole.block`) as a mesh [m] about its centre, along its own axes;
+    where there is none, that of an earlier motion goes.
+    """
+    if block is None:
+        path.unlink(missing_ok=True)
+        return
+    signs = np.array([[(k >> axis & 1) * 2 - 1 for axis in range(3)] for k in range(8)])
+    lines = ["o platform"]
+    lines += ["v {:.9g} {:.9g} {:.9g}".format(*corner) for corner in signs * block[0]]
+    for axis in range(3):
+        one, other = (1 << (axis + 1) % 3), (1 << (axis + 2) % 3)
+        for base, first, second in ((0, other, one), (1 << axis, one, other)):
+            around = (base, base + first, base + first + second, base + second)  # seen from outside
+            lines.append("f " + " ".join(str(corner + 1) for corner in around))
+    write_file(path, "\n".join([*lines, ""]).encode())
 
 
 def _encoded(ending: str, content: Any) -> bytes:

@@ -68,7 +68,11 @@ FORMATS = {
     "bones-csv": ("bones.csv", 120.0),
     "mujoco": ("mujoco", 1000.0),
 }
-EXPORTS = tuple(file for file, _ in FORMATS.values())
+# formats with an object on which a motion ends, and behind the name of the file its mesh
+WITH_OBJECT = ("holosoma-npz", "unilab-npz")
+MESH = "_platform.obj"
+MESHES = tuple(FORMATS[name][0].removesuffix(".npz") + MESH for name in WITH_OBJECT)
+EXPORTS = (*(file for file, _ in FORMATS.values()), *MESHES)
 # what a new simulation makes untrue and therefore removes, and what a new plan does
 OF_SIMULATION = ("jump.html", *(f"simulated_{name}" for name in EXPORTS))
 TRIALS = ("trials.jsonl", "trials.json", "basin.json", "margins.json")

@@ -59,6 +59,9 @@ USUAL_SIZE = 4500  # variables, up to which that holds; larger programs have mor
 # core
 ITERATION_S = 0.12
 RISING_S = 0.06  # in which a foot that follows a motion rises or comes down by its clearance
+# a motion that is followed begins beyond many limits: from further inside them all its first steps
+# are longer, and it ends in the same place
+INSIDE = dict.fromkeys(("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac"), 0.1)
 ROUNDS = 4  # of rows for links that met
 BUILT = 8  # programs with such rows that are kept
 
@@ -195,10 +198,11 @@ class Program(Shown):
         so that a plan does not depend on them.
         """
         limit_s = most_s
+        inside = INSIDE if self.follows else {}
         while True:
             began = time.thread_time()
             limit = {"max_iter": start.patience, "max_cpu_time": limit_s}
-            options = {**IPOPT, **start.options, **limit, **self.options}
+            options = {**IPOPT, **inside, **start.options, **limit, **self.options}
             try:
                 return built.with_options(options, HOLD if start.held else None).solve(**given)
             except SolverError as e:

@@ -1,0 +1,75 @@
+"""The page of a library of clips: a picture of each, in a file that refers to those beside it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+from jinja2 import Template
+
+from jumplab.io.files import write_file
+from jumplab.io.motion import Motion
+from jumplab.robot import Robot
+from jumplab.show.jumps import jump_strobe
+from jumplab.show.movies import write_movie
+from jumplab.show.style import describe_task, made_with
+from jumplab.show.viewer import Page
+from jumplab.sim.scene import Scene
+from jumplab.task import JumpTask
+
+STRIP = "strip.png"
+FILM = "film.gif"
+STRIP_DPI = 80  # 40 kB
+
+
+def draw_strip(folder: Path, robot: Robot, motion: Motion, scene: Scene) -> str:
+    """Draw a motion's phases as a strip into a folder, unless it has one; returns the file's name.
+
+    The ``scene`` is not drawn.
+    """
+    if not (folder / STRIP).is_file():
+        fig = jump_strobe(motion, robot)
+        buffer = io.BytesIO()
+        fig.savefig(buffer, format="png", dpi=STRIP_DPI)
+        plt.close(fig)
+        write_file(folder / STRIP, buffer.getvalue())
+    return STRIP
+
+
+def draw_film(folder: Path, robot: Robot, motion: Motion, scene: Scene) -> str:
+    """Draw a film of a motion into a folder, unless it has one; returns the file's name."""
+    if not (folder / FILM).is_file():
+        write_movie(folder / FILM, robot, motion, scene)
+    return FILM
+
+
+def clips_page(index: Mapping[str, Any]) -> Page:
+    """The page of a library (its index), by ``library.html``, to stand beside its folders."""
+    done = [*index["clips"], *index["left_out"]]
+    title = f"{len(index['clips'])} clips of {index['robot']['name']}"
+    form = (resources.files("jumplab.show") / "library.html").read_text(encoding="utf-8")
+    page = Template(form, autoescape=True).render(
+        title=title,
+        index=index,
+        kinds=dict.fromkeys(row["kind"] for row in done),
+        missing=index["targets"] - len(done),
+        describe=_described,
+        made_with=made_with(),
+    )
+    return Page(page, title)
+
+
+def _described(row: Mapping[str, Any]) -> str:
+    """The target of a clip in words; of a schedule its feet."""
+    target = row["target"]
+    if "phases" in target:
+        words = f"feet {' '.join(phase['feet'] for phase in target['phases'])}"
+        ahead_m = max([place["ahead_m"] for place in target["places"]])
+        words += f", {ahead_m:.2f} m ahead"
+    else:
+        words = describe_task(JumpTask(**target))
+    return words
