@@ -47,7 +47,8 @@ from jumplab.task import JumpTask
 
 EXPLAINING = 30  # iterations of the search before its failure is explained
 BROKEN = 1.5  # times a limit between the nodes, beyond which a motion is none
-# and beyond which, settled, it is another motion on a finer mesh, if any: a new start is worth more
+# and beyond which a new start is worth more than ever finer meshes, where half of the time is over
+# (before, it is no verdict: a CoP of hardly any force can be anywhere)
 HOPELESS = 10.0
 # with more than that to turn only the exact Hessian settles, so it is tried first
 HELD_TURN_RAD = np.radians(100)
@@ -285,8 +286,8 @@ class WholeBodyPlanner:
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
         # what is followed is settled
         for further in REFINED[program.follows :]:
-            hopeless = further is not SETTLED and best.used > HOPELESS
-            if best.used <= 1 or hopeless or program.spent(asked):
+            late = asked.spent_s > program.left_s(asked)
+            if best.used <= 1 or (late and best.used > HOPELESS) or program.spent(asked):
                 break
             program = program if further is SETTLED else program.finer
             try:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jumplab.stages.whole_body.program import Program, Solved
     from jumplab.task import JumpTask
 
-NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 3e-4}
+NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 5e-4}
 # where a motion passes limits between the nodes, it often is not settled: from there on with
 # smaller steps of the cost
 PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
@@ -149,7 +149,8 @@ def from_neighbour(program: Program, asked: Asked) -> Beginning:
     if near.schedule.free.kind == program.free.kind:
         return from_solved(program, near)
     size = len(program.free.names)
-    charts = [x.q[:, :size] for x in near.phases.values()]
+    meshes = zip(near.phases.values(), program.contacts.phases, strict=True)
+    charts = [x.guess(phase.intervals).q[:, :size] for x, phase in meshes]
     durations = np.array([x.duration for x in near.phases.values()])
     return Beginning(guess(program.schedule(), Motion(durations, charts)))
 
