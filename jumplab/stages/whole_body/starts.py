@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jumplab.stages.whole_body.program import Program, Solved
     from jumplab.task import JumpTask
 
-NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 5e-4}
+NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 3e-4}
 # where a motion passes limits between the nodes, it often is not settled: from there on with
 # smaller steps of the cost
 PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
