@@ -290,16 +290,26 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_
     assert plans[2].used == 1.2
 
 
-def test_a_motion_far_beyond_the_limits_between_the_nodes_is_not_made_finer(doubted):
-    """Settled it is still no motion, and the next start costs less than a finer mesh; a little beyond it is one."""
+@pytest.mark.parametrize(
+    ("late", "shares", "third"),
+    [
+        (True, (30.0, 20.0, 0.9), "neighbour"),
+        (True, (30.0, 2.0, 0.9), "finer mesh"),
+        (False, (30.0, 20.0, 0.9), "finer mesh"),
+    ],
+)
+def test_a_motion_far_beyond_the_limits_between_the_nodes_is_not_made_finer_late(
+    doubted, monkeypatch, late, shares, third
+):
+    """Where half of the time is over, the next start is worth more than a finer mesh, but for a motion that is nearly
+    one.
+    """
     last, known, said = doubted
-    for shares, names in (
-        ((30.0, 20.0, 0.9), ["neighbour", "settled", "neighbour"]),
-        ((30.0, 2.0, 0.9), ["neighbour", "settled", "finer mesh"]),
-    ):
-        said(*shares)
-        plan = last(AHEAD, near=known)
-        assert [x.start for x in plan.attempts] == names and plan.used == 0.9
+    if late:
+        monkeypatch.setattr(Program, "left_s", lambda self, asked: asked.spent_s / 2 + 1e-6)
+    said(*shares)
+    plan = last(AHEAD, near=known)
+    assert [x.start for x in plan.attempts] == ["neighbour", "settled", third] and plan.used == 0.9
 
 
 def test_where_the_patience_is_spent_nothing_more_is_tried(doubted, monkeypatch):

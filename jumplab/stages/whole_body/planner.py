@@ -286,7 +286,7 @@ class WholeBodyPlanner:
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
         # what is followed is settled
         for further in REFINED[program.follows :]:
-            late = asked.spent_s > program.left_s(asked)
+            late = further is not SETTLED and asked.spent_s > program.left_s(asked)
             if best.used <= 1 or (late and best.used > HOPELESS) or program.spent(asked):
                 break
             program = program if further is SETTLED else program.finer
