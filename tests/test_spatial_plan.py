@@ -301,7 +301,7 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_
 def test_a_motion_far_beyond_the_limits_between_the_nodes_is_not_made_finer_late(
     doubted, monkeypatch, late, shares, third
 ):
-    """Where half of the time is over, the next start is worth more than a finer mesh, but for a motion that is nearly
+    """With half of the time over, the next start is worth more than a finer mesh, but for a motion that is nearly
     one.
     """
     last, known, said = doubted

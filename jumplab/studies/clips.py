@@ -59,8 +59,8 @@ WORDS = """Clips of the robot {name}, made by jumplab {jumplab}.
 
 Every motion is computed from a description of the robot; none is a recording of a person.
 
-Motions, plans, simulations and pictures: BSD 3-Clause License, as jumplab has it. Whoever made this
-library may replace this sentence by another licence.
+Motions, plans, simulations and pictures: BSD 3-Clause License, as jumplab has it. Makers of
+libraries may replace this sentence by another licence.
 
 Robot: {source}.
 Files that describe it (robot.urdf and robot.toml in every folder, and exports with a robot in them)
@@ -175,8 +175,8 @@ def make_clips(
 
     A clip passes if its plan passes the audit, and lands in every engine, all of them within
     the limits of :data:`.certify.LIMITS` of each other. It shows the simulated jump, from stand to
-    stand, in the default engine. What failed is not tried again unless the code, the robot or the
-    target has changed, or its name is among ``only``.
+    stand, in the default engine. A clip that failed is not tried again unless the code, the robot
+    or the target has changed, or its name is among ``only``.
 
     Parameters
     ----------
