@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, refused, root
+from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, refused, root, torso
 
 from jumplab.errors import RobotError
 from jumplab.robot_import.checkup import check
@@ -33,7 +33,8 @@ def test_roles_of_every_variant(variant):
     roles = find_roles(tree(ET.fromstring(variant()[0])))
     assert {k: v for k, v in roles.joints.items() if k != "shoulder_pitch"} == LEGS
     last = "ankle_link" if variant is one_axis_ankle else "foot"  # the foot is then fixed to it
-    assert roles.feet == (f"left_{last}", f"right_{last}") and roles.trunk == "trunk"
+    assert roles.feet == (f"left_{last}", f"right_{last}")
+    assert roles.trunk == ("pelvis" if variant is torso else "trunk")
     assert (roles.forward, roles.up) == ("+x", "+z")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -16,7 +15,7 @@ from jumplab.io.motion import Motion
 from jumplab.robot import Robot
 from jumplab.show.jumps import jump_strobe
 from jumplab.show.movies import write_movie
-from jumplab.show.style import describe_task, made_with
+from jumplab.show.style import describe_task, file_of, made_with
 from jumplab.show.viewer import Page
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
@@ -33,10 +32,8 @@ def draw_strip(folder: Path, robot: Robot, motion: Motion, scene: Scene) -> str:
     """
     if not (folder / STRIP).is_file():
         fig = jump_strobe(motion, robot)
-        buffer = io.BytesIO()
-        fig.savefig(buffer, format="png", dpi=STRIP_DPI)
+        write_file(folder / STRIP, file_of(fig, "png", dpi=STRIP_DPI))
         plt.close(fig)
-        write_file(folder / STRIP, buffer.getvalue())
     return STRIP
 
 

@@ -122,7 +122,7 @@ class Picture(Figure):
         """The figure as a PNG."""
         if self._saved and not self.stale:
             return self._saved
-        return _file_of(self, "png", dpi=self.get_dpi(), metadata=PNG_METADATA)
+        return file_of(self, "png", dpi=self.get_dpi(), metadata=PNG_METADATA)
 
     @property
     def _repr_png_(self) -> Callable[[], bytes] | None:
@@ -137,8 +137,8 @@ class Picture(Figure):
         return f'<figure style="margin: 0">{image}<figcaption>{words}</figcaption></figure>'
 
 
-def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
-    """A figure as a file of that kind; ``how`` are options of ``Figure.savefig``."""
+def file_of(fig: Figure, kind: str, **how: Any) -> bytes:
+    """A figure as a file of that kind ("png", "pdf"); ``how`` are options of ``Figure.savefig``."""
     buffer = io.BytesIO()
     with styled, rc_context(getattr(fig, "settings", {})):
         fig.savefig(buffer, format=kind, **how)
@@ -275,9 +275,9 @@ def save_figure(
     if not name or Path(name).name != name or name.startswith("."):
         must = "must be a plain file name without ending, such as 'f08_joints'"
         raise InputError(f"figure name {name!r}: {must}")
-    png = _file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
+    png = file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
     fig.set_layout_engine("none")
-    pdf = _file_of(fig, "pdf", metadata=PDF_METADATA)
+    pdf = file_of(fig, "pdf", metadata=PDF_METADATA)
     fig.caption = caption.strip()
     fig._saved = png  # a notebook shows it without drawing it again ...
     fig.stale = False  # ... until it is changed
