@@ -491,7 +491,7 @@ def test_a_leaning_foot_is_levelled_as_advised(put):
     """The ankle of a foot that leans by 0.2 rad with all joints at 0 is to count from where it is level."""
     tilted = changed(URDF, ('<origin xyz="0.03 0 -0.05"/><', '<origin xyz="0 0 -.05" rpy="0 .2 0"/><'))
     sentence = refused(lambda: draft(put(tilted)))
-    advice = r"stands on its toes, 11 deg .* joint 'left_ankle_pitch'.* frame by (\S+) rad about its axis, .* range by (\S+)"
+    advice = r"stands on its toes, 11 deg .*'left_ankle_pitch'.* frame by (\S+) rad about its axis, .* range by (\S+)"
     turn, shift = map(float, re.search(advice, sentence).groups())
     level = re.sub(r'(_ankle_pitch_link"/><origin xyz="[^"]*")', rf'\1 rpy="0 {turn} 0"', tilted)
     level = changed(level, ('lower="-0.9" upper="0.7"', f'lower="{shift - 0.9}" upper="{shift + 0.7}"'))
