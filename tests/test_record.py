@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -115,6 +116,16 @@ def test_what_makes_no_sense_is_refused_before_anything_is_solved(what, options,
     monkeypatch.setattr(study, "_Search", None)
     with pytest.raises(InputError, match=sentence):
         jl.record("bhr", what, **options)
+
+
+def test_smaller_shares_are_played_one_after_the_other(monkeypatch):
+    """Where no engine lands, 95, 90, 85, 80 and 75 % are tried, and the last one is told."""
+    said = []
+    monkeypatch.setattr(study, "tell", said.append)
+    monkeypatch.setattr(study, "simulate_jump", lambda *given, **how: SimpleNamespace(landed=False))
+    found = jl.record("bhr", "height_m", jl.JumpTask(0.2, 0.2))
+    tried = [words.split()[1] for words in said if words.startswith("playing")]
+    assert tried == ["95%", "90%", "85%", "80%", "75%"] and found.share == pytest.approx(0.75)
 
 
 def test_the_command_prints_the_record_and_its_prices(highest, prices, monkeypatch, capsys, tmp_path):

@@ -368,8 +368,7 @@ class _Search:
         """
         runs: dict[str, SimulationResult] = {}
         task = plan.task
-        for less in range(TRIED if engines else 0):
-            tried = share - LESS * less
+        for tried in [share - LESS * less for less in range(TRIED if engines else 0)]:
             tell(f"playing {tried:.0%} of the record")
             with suppress(InfeasibleError, SolverError):
                 plan = self.planner.plan(self.at(task, tried), "direct", near=plan)
