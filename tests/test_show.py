@@ -163,6 +163,19 @@ def test_curves_change_colour_with_the_phase():
     assert [len(line.get_xdata()) for line in lines] == [3, 2, 1]
 
 
+@pytest.mark.parametrize(
+    ("curves", "sentence"),
+    [
+        ([(np.zeros(3), np.zeros(3))], r"a curve must be \(t, y, phase\), got 2 values"),
+        ([(np.zeros(2), np.zeros(2), np.array(["flight"] * 2)), (np.zeros(3),)], r"must be \(t, y\), got 1 values"),
+        ([(np.zeros(2), np.zeros(2), np.array(["flight"] * 2)), (np.zeros(3), np.zeros(2))], r"y of a reference must"),
+    ],
+)
+def test_curves_that_lack_something_are_refused(curves, sentence):
+    with pytest.raises(InputError, match=sentence):
+        plotting.compare(plotting.new_figure().subplots(), *curves)
+
+
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.name)
 def test_sources_neither_show_nor_print(path):
     calls = [n.func for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)]

@@ -203,10 +203,16 @@ def compare(
     marks: Iterable[float] = (),
     **kwargs,
 ) -> None:
-    """A curve (t, y, phase), references (t, y) dashed, ``marks`` where phases change [s]."""
+    """A curve (t, y, phase), references (t, y) dashed, ``marks`` where phases change [s]; all (N,).
+
+    Raises :class:`InputError` for others.
+    """
+    for given, words in ((curve, "t, y, phase"), *((x, "t, y") for x in references)):
+        if len(given) != len(words.split()):
+            raise InputError(f"a curve must be ({words}), got {len(given)} values")
     by_phase(ax, *curve, **kwargs)
-    for reference in references:
-        ax.plot(*reference, **REFERENCE_STYLE)
+    for t, y in references:
+        ax.plot(t, shaped(y, (len(t),), "y of a reference"), **REFERENCE_STYLE)
     mark_time(ax, marks)
     ax.set_ylabel(label)
 
