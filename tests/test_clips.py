@@ -246,6 +246,8 @@ def test_the_page_tells_schedules_variants_and_what_is_not_made_yet():
     row |= {"file": "hop-1_mass=1.1/x.npz"}
     bad = {"name": "hop-2", "kind": "hop", "target": hop, "split": "training", "reasons": ["<it> falls"]}
     index = {"robot": {"name": "g1"}, "format": "npz", "targets": 5, "clips": [row], "left_out": [bad]}
+    with pytest.raises(InputError, match="the index of a library lacks 'robot'"):
+        library.clips_page({})
     page = library.clips_page(index).html
     for words in ("hop-1_mass%3D1.1/x.npz", "feet LR L - LR, 0.20 m ahead", "held-out", "&lt;it&gt; falls"):
         assert words in page

@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from jinja2 import Template
 
+from jumplab.errors import InputError
 from jumplab.io.files import write_file
 from jumplab.io.motion import Motion
 from jumplab.robot import Robot
@@ -20,6 +21,7 @@ from jumplab.show.viewer import Page
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
 
+INDEX = "robot", "targets", "clips", "left_out"  # keys of an index that the page shows
 STRIP = "strip.png"
 FILM = "film.gif"
 STRIP_DPI = 80  # 40 kB
@@ -45,7 +47,12 @@ def draw_film(folder: Path, robot: Robot, motion: Motion, scene: Scene) -> str:
 
 
 def clips_page(index: Mapping[str, Any]) -> Page:
-    """The page of a library (its index), by ``library.html``, to stand beside its folders."""
+    """The page of a library (its index), by ``library.html``, to stand beside its folders.
+
+    Raises :class:`InputError` for an index that lacks something.
+    """
+    if missing := [key for key in INDEX if key not in index]:
+        raise InputError(f"the index of a library lacks {missing[0]!r}; give its index.json")
     done = [*index["clips"], *index["left_out"]]
     title = f"{len(index['clips'])} clips of {index['robot']['name']}"
     form = (resources.files("jumplab.show") / "library.html").read_text(encoding="utf-8")
