@@ -48,6 +48,11 @@ def tape():
     return jump(0.6, 0.3, method="direct").tape
 
 
+def test_a_negative_seed_is_refused(bhr):
+    with pytest.raises(InputError, match="^seed = -3 must not be negative$"):
+        Perturbation.draw(bhr, -3)
+
+
 def test_the_robots_of_the_usual_ranges_stay_the_same(bhr):
     """Further disturbances are drawn from a stream of their own, and change no number of those before."""
     drawn = [Perturbation.draw(bhr, seed, noise=SensorNoise.typical()).to_json() for seed in range(20)]

@@ -231,8 +231,10 @@ class Perturbation:
         same robot.
 
         Nothing that is drawn is known to the controllers; of the delay they know the middle of its
-        range.
+        range. Raises :class:`InputError` for a negative seed.
         """
+        if seed < 0:
+            raise InputError(f"seed = {seed} must not be negative")
         rng = np.random.default_rng(seed)
         # a stream of its own, all of it drawn whatever the ranges: a wider one changes no other
         # number
