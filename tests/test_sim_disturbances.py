@@ -49,7 +49,7 @@ def tape():
 
 
 def test_a_negative_seed_is_refused(bhr):
-    with pytest.raises(InputError, match="^seed = -3 must not be negative$"):
+    with pytest.raises(InputError, match=r"^seed = -3 must not be negative$"):
         Perturbation.draw(bhr, -3)
 
 
