@@ -108,9 +108,12 @@ def stored(engine: str, feature: str, path: Path = LOG) -> list[SimpleNamespace]
     return sorted(here, key=lambda r: r.number)
 
 
-def origin(path: Path = LOG) -> tuple[str, str]:
-    """Mode in which the kept robots jumped, and their plan in words; what has no stamp is of the former version."""
-    if logs.lines(path)[0][1]:
+def origin(path: Path = LOG, feature: str = "") -> tuple[str, str]:
+    """Mode in which the kept robots whose draw has ``feature`` jumped (by default all), and their plan in words; what
+    has no stamp is of the former version.
+    """
+    stamps = [stamp for row, stamp in logs.lines(path) if not feature or feature in row["features"]]
+    if stamps[0]:
         return TrialSettings().mode, "plan of the direct program"
     return "whole-body", "plan of the five-link program of the former version"
 
