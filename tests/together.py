@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import threading
 import time
@@ -112,6 +113,7 @@ def together(folder: Path) -> Callable:
         for each in threads:
             each.join()
         out.write_text(json.dumps(rows))
+        os._exit(0)  # a forked process waits at its end for idle workers of joblib, which leave after five minutes
 
     def case(number: int, rng: random.Random) -> dict[str, Any]:
         place = Path(mkdtemp(dir=folder))
