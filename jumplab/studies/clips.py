@@ -213,11 +213,11 @@ def make_clips(
     rows: dict[bool, list[Plain]] = {True: [], False: []}
     library = {"clips": rows[True], "left_out": rows[False]}
     with made(out), locked(out, wait_s=0.0):  # one library at a time
-        store.write_file(out / LICENCE, _licence(robot).encode())
         try:
             for row in in_parallel(work, jobs, "generator"):
                 rows[row["passed"]].append(row)
                 store.settle()
+                store.write_file(out / LICENCE, _licence(robot).encode())
                 store.write_file(out / INDEX, store.to_json(head | library).encode())
                 if page:
                     store.write_file(out / PAGE, page(head | library).encode())
