@@ -119,7 +119,7 @@ def test_what_makes_no_sense_is_refused_before_anything_is_solved(what, options,
 
 
 def test_smaller_shares_are_played_one_after_the_other(monkeypatch):
-    """Where no engine lands, 95, 90, 85, 80 and 75 % are tried, and the last one is told."""
+    """If no engine lands: 95, 90, 85, 80 and 75 % are tried, and the last one is told."""
     said = []
     monkeypatch.setattr(study, "tell", said.append)
     monkeypatch.setattr(study, "simulate_jump", lambda *given, **how: SimpleNamespace(landed=False))
