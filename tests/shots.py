@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 URDF = ROOT / "tests" / "mini.urdf"
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
 LOGS = ".jsonl"  # finished pieces of work are kept, ...
-TAPES = "/tapes/"  # ... and their motions, whole files that are written before their line
+TAPES = "/tapes/"  # ... and the motions that they list
 LOOK_S, FAMILY = 0.01, 10  # children are looked for at every tenth look
 ORPHAN_S, LONGEST_S = 60.0, 900.0
 START_S = 1.5  # a new process imports for so long
@@ -144,7 +144,9 @@ def content(place: Path) -> dict[str, bytes]:
 
 
 def kept(files: dict[str, bytes]) -> dict[str, bytes]:
-    return {name: raw for name, raw in files.items() if not (name.endswith(LOGS) or TAPES in name)}
+    lines = b"".join(raw for name, raw in files.items() if name.endswith(LOGS)).decode()
+    listed = {name for name in files if TAPES in name and Path(name).stem in lines}
+    return {name: raw for name, raw in files.items() if not name.endswith(LOGS) and name not in listed}
 
 
 def good(folder: Path) -> Path:

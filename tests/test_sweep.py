@@ -13,6 +13,7 @@ from test_store import names
 from jumplab.cli.common import values_of
 from jumplab.cli.studies import choices_of
 from jumplab.errors import InputError
+from jumplab.io.files import Log
 from jumplab.studies import study, sweep
 from jumplab.task import JumpTask
 
@@ -30,6 +31,24 @@ def test_grid_runs_distances_fastest():
     assert len(cases) == 8 and len({c.key() for c in cases}) == 8
     assert [(c.task.distance_m, c.task.height_m) for c in cases[:3]] == [(0.1, 0.3), (0.2, 0.3), (0.1, 0.4)]
     assert cases[4].weights == {"torque": 2.0}
+
+
+def test_a_motion_that_was_stopped_before_its_line_goes(tmp_path, monkeypatch):
+    """Of two cases the second is stopped between its motion and its line; files of others stay."""
+    (tmp_path / sweep.TAPES).mkdir()
+    (tmp_path / sweep.TAPES / "mine.npz").write_bytes(b"mine")
+    add, lines = Log.add, []
+
+    def stopped(log, line):
+        lines.append(line)
+        if len(lines) == 2:
+            raise KeyboardInterrupt
+        add(log, line)
+
+    monkeypatch.setattr(Log, "add", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        sweep.run(sweep.grid([0.3, 0.4], [0.2]), tmp_path, jobs=1, tapes_hz=50)
+    assert names(tmp_path / sweep.TAPES) == sorted([f"{lines[0]['key']}.npz", "mine.npz"])
 
 
 def test_values_as_they_are_typed():

@@ -46,11 +46,6 @@ class Link:
     first: np.ndarray  # (3,) mass times CoM [kg m]
     second: np.ndarray  # (3, 3) inertia about the origin [kg m^2]
 
-    @property
-    def numbers(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """mass, first, second."""
-        return self.mass, self.first, self.second
-
 
 def _clean(x: np.ndarray) -> np.ndarray:
     return np.where(np.abs(x) < ROUNDING, 0.0, x)
@@ -431,10 +426,10 @@ class SpatialState:
     @cached_property
     def _inertial(self) -> dict[int, tuple[ca.SX, ca.SX]]:
         """(force, moment about its origin) that the motion of each body needs, in its axes."""
-        bodies = self.model.bodies
-        return {k: self._moved(k, *bodies[k].numbers) for k in self._counted}
+        counted = {k: self.model.bodies[k] for k in self._counted}
+        return {k: self._inertial_of(k, b.mass, b.first, b.second) for k, b in counted.items()}
 
-    def _moved(
+    def _inertial_of(
         self, k: int, mass: float, first: np.ndarray, second: np.ndarray
     ) -> tuple[ca.SX, ca.SX]:
         """The same of anything that is rigid with a body; see :class:`Link`."""
@@ -466,7 +461,7 @@ class SpatialState:
         first = part.mass * part.lever
         lever = pin.skew(part.lever)
         second = part.inertia - part.mass * lever @ lever
-        force, moment = self._moved(0, part.mass, first, second)
+        force, moment = self._inertial_of(0, part.mass, first, second)
         for k in self._counted:
             if self.model.bodies[k].name in joint.joints:
                 more = self._passed(k, abs(joint.place[1]) < EXACT_M)

@@ -54,7 +54,9 @@ TARGET = "distance", "height"  # what of a target varies: its lengths along the 
 # ... and of the robot; other legs would be another robot's clips
 ROBOT = "mass", "effort", "speed"
 SPLIT = "training", "held-out"
-(EVERY, FIRST) = 5, 1  # of the different targets of a kind these are held out
+# of the different targets of a kind one in so many is held out, beginning with this one
+EVERY = 5
+FIRST = 1
 WORDS = """Clips of the robot {name}, made by jumplab {jumplab}.
 
 Every motion is computed from a description of the robot; none is a recording of a person.

@@ -185,14 +185,20 @@ def run(
     for name in dict.fromkeys(case.robot for case in cases) if atlas else ():
         places[name] = _atlas(reading.below(folder, "atlas"), cases, name, jobs)
     work = {}
+    tapes = {}
     for case in cases:
         place = places.get(case.robot)
         name = case.key(tapes_hz, place and place.name)
         tape = reading.below(folder, TAPES) / f"{name}.npz" if tapes_hz else None
         work[name] = joblib.delayed(run_case)(case, place, tape, tapes_hz)
+        tapes[name] = tape
     study = open_study(folder / CASES, "sweep", total=len(cases), jobs=jobs, progress=progress)
     with on_cluster(cluster) if cluster else nullcontext(), study as study:
-        rows = study.results(work)
+        try:
+            rows = study.results(work)
+        finally:
+            for name in tapes.keys() - study.done.keys() if tapes_hz else ():
+                tapes[name].unlink(missing_ok=True)  # written, but stopped before its line
         settle()
         write_file(folder / TABLE, _csv(rows).encode())
     return rows

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from jumplab.stages.whole_body.program import Program, Solved
     from jumplab.task import JumpTask
 
+# from a first barrier of 1e-4 jumps aside take up to twice the steps, from one of 5e-4 some wander
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 3e-4}
 # where a motion passes limits between the nodes, it often is not settled: from there on with
 # smaller steps of the cost
