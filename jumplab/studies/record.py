@@ -280,7 +280,7 @@ class _Search:
             try:
                 near = self.stage.solved(task)
                 program = self.program(task)
-                solved = program.solve(Asked(task, near=near), SEEKING)
+                solved = program.solve_apart(Asked(task, near=near), SEEKING)
             except (InfeasibleError, SolverError) as e:
                 refusal = e
                 continue

@@ -26,6 +26,7 @@ from jumplab.stages.whole_body.terms import (
     dynamics,
     flight_rows,
     foot_rows,
+    gentle_heels,
     largest,
     link_distance,
     loads,
@@ -177,6 +178,8 @@ class Schedule:
             terms += touchdown_rows(m)
         met = [x for x in self.apart if x.phase == k]
         terms += [link_distance(m, x, phases[k].intervals) for x in met]
+        if self.sought and m.raised:
+            terms.append(gentle_heels(m))
         if last and self.sought:
             terms.append(largest(self.sought[0]))
         return terms

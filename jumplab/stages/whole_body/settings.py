@@ -29,6 +29,9 @@ class Limits:
     cop_reserve_share: float = 0.125
     least_push: float = 0.0  # share of the weight that both flat feet carry at least
     heel_up_rad: float = 0.9  # foot pitch at most during toe-off
+    # [rad/s^3] of that pitch, of a record: where it changes by twice as much within a step of the
+    # tape, which is 1 ms for all robots, accelerations are 4 rad/s^2 off the rates
+    heel_jerk: float = 1.6e4
     straight_knee_rad: float = 0.15  # flexion at least while a foot carries: a leg
     # nearly straight has hardly a rate for what its foot has to do, and tapes have jumps there
     flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot phase
@@ -199,7 +202,7 @@ LIMIT_UNITS |= dict.fromkeys(("flat_s", "toe_s", "capture_slope_s"), "s")
 LIMIT_UNITS |= {
     name: "rad/s" for name in vars(Limits()) if name.startswith("touchdown_") and "_rate" in name
 }
-LIMIT_UNITS |= {"touchdown_turning": "rad/s", "momentum_slack": "N m s"}
+LIMIT_UNITS |= {"heel_jerk": "rad/s^2", "touchdown_turning": "rad/s", "momentum_slack": "N m s"}
 WEIGHT_UNITS = {
     "acceleration": "(rad/s^2)^-2/s",
     "jerk": "(rad/s^3)^-2/s",

@@ -213,6 +213,15 @@ def largest(name: str) -> Term:
     return Term(RECORD, *of, lambda p: FAR - getattr(p.p, name), WORTH / (2 * FAR))
 
 
+def gentle_heels(m: Mode) -> Term:
+    """Heels begin to rise so gently that angles, rates and accelerations of a 1 kHz tape agree:
+    effort, which else sees to that, counts little beside a record.
+    """
+    most = m.limits.heel_jerk
+    words = "heels rise gently", "ours: the tape's steps", "rad/s^3", "mid"
+    return Term(*words, lambda p: p.j[m.nv :], lower=-most, upper=most, scale=most)
+
+
 # feet on the ground
 # ---------------------------------------------------------------------------------------------
 def kept_rows(m: Mode, side: int, rows: ca.SX, yaw_and_roll: ca.SX) -> ca.SX:
