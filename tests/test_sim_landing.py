@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from jumplab.control import LandingController
 from jumplab.control.body import PERIOD_STEPS, WholeBody
-from jumplab.control.landing import GAINS
+from jumplab.control.landing import GAINS, MAX_BACK
 from jumplab.control.playback import Command
 from jumplab.control.servo import WholeBodyServo
 from jumplab.ocp.qp import QpSolver
@@ -69,6 +69,13 @@ def crouched(robot, vx, knee=1.0, pitch=0.15, vz=-3.0):
     v = np.zeros(robot.model.nv)
     v[:3] = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix().T @ [vx, 0, vz]
     return q, v
+
+
+def sole_acceleration(robot, q, v, a):
+    """Upward acceleration of the middle of the left sole under ``a`` (nv,) [m/s^2]."""
+    body = WholeBody(robot)
+    body.update(q, v)
+    return float((body.sole_rows[0, :, : body.nv] @ a + body.sole_drift[0])[2])
 
 
 def test_body_terms_obey_newton(bhr):
@@ -194,4 +201,32 @@ def test_a_joint_at_its_stop_is_led_away_from_it(bhr):
         assert least - 1e-6 <= wish[arm] <= 300.0 and weight[arm] == GAINS.stop_weight, angle
     q[7 + arm] = lower + 0.06  # beyond the margin the posture's own wish has it
     wish, weight = control.posture_wish(q, np.zeros(bhr.model.nv))
-    assert wish[arm] > 100.0 and weight[arm] == GAINS.arm_posture_weight
+    assert wish[arm] == pytest.approx(2 * GAINS.posture_rate * MAX_BACK)
+    assert weight[arm] == GAINS.arm_posture_weight
+
+
+@pytest.mark.parametrize("off_rad", (-3.0, -0.1))
+def test_a_joint_goes_back_to_the_stance_no_faster_than_it_may(bhr, off_rad):
+    """At the rate it goes back with, nothing is asked of it; far off that rate does not grow with the way."""
+    control, q, v = LandingController(bhr), stance_configuration(bhr), np.zeros(bhr.model.nv)
+    arm = bhr.joint_names.index("left_shoulder_pitch")
+    control.body.update(q, v)
+    q[7 + arm] += off_rad
+    v[6 + arm] = min(MAX_BACK, -off_rad * GAINS.posture_rate / 2)
+    assert control.posture_wish(q, v)[0][arm] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("gap_m", "stands"), [(0.015, True), (0.025, False)])
+def test_feet_that_both_bounced_are_pressed_down_again(bhr, gap_m, stands):
+    """Just over the ground that they met both stand; feet that hover in step with each other would never meet it."""
+    control, q, v = LandingController(bhr), stance_configuration(bhr), np.zeros(bhr.model.nv)
+    control.body.update(q, v)
+    assert control.standing(0.0, np.full(2, 200.0)).all()
+    q[2] += gap_m
+    control.body.update(q, v)
+    assert control.standing(0.1, np.zeros(2)).tolist() == [stands, stands]
+    if not stands:
+        tau = control.torque(0.1, q, v, np.zeros(2))
+        data = bhr.model.createData()
+        falls = pin.aba(bhr.model, data, q, v, np.concatenate([np.zeros(6), tau]))
+        assert sole_acceleration(bhr, q, v, falls) < -bhr.gravity - 1.0

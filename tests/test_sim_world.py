@@ -69,6 +69,20 @@ def test_base_conversion_by_hand():
     assert velocity == pytest.approx([0, -1, 0])
 
 
+def test_a_state_is_that_of_now_and_belongs_to_who_asked(engine, bhr):
+    """Asked twice it is the same, whatever became of the first answer; after a step it is another one."""
+    q = stance_configuration(bhr)
+    q[2] += 1.0
+    with engine(bhr, q) as world:
+        first, at_rest = world.state()
+        kept = first.copy()
+        first[:], at_rest[:] = 0.0, 1.0
+        again, still = world.state()
+        assert again.tolist() == kept.tolist() and not still.any()
+        world.step()
+        assert world.state()[1][2] < -0.009  # falls
+
+
 def test_free_flight_conserves_momentum(engine, bhr):
     """No damping anywhere: the CoM falls as a stone does, L stays. Bullet's default damping would eat 3 % of L."""
     q, v = random_state(bhr, 0)

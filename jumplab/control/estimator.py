@@ -101,6 +101,7 @@ FLOOR = SensorNoise(
 # foot, right foot
 TURN, SPEED, PLACE, GYRO, ACCEL, *FEET = (slice(i, i + 3) for i in range(0, 21, 3))
 SIZE = 21
+UNIT = np.eye(3)
 
 
 class Estimator:
@@ -134,6 +135,9 @@ class Estimator:
         self._loaded_n = max(large.of(LOADED_N, "N"), SURE * n.force)
         spread = np.repeat([n.tilt_rad, 1e-3, 1e-3, n.gyro_bias, n.accel_bias, 1e-3, 1e-3], 3)
         self._cov = np.diag(spread**2)
+        # how errors grow within a step; what does not change from step to step
+        self._step = np.eye(SIZE)
+        self._step[PLACE, SPEED] = STEP_S * UNIT
 
     def update(self, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
         """Estimated configuration (nq,) and velocity (nv,) at the time of ``reading``."""
@@ -153,17 +157,17 @@ class Estimator:
         push = self._attitude @ force
         self._x[SPEED] += (push + self._gravity) * STEP_S
         self._x[PLACE] += self._x[SPEED] * STEP_S
-        step = np.eye(SIZE)
+        step = self._step
         step[SPEED, TURN] = -STEP_S * pin.skew(push)
         step[TURN, GYRO] = step[SPEED, ACCEL] = -STEP_S * self._attitude
-        step[PLACE, SPEED] = STEP_S * np.eye(3)
         drive = np.zeros(SIZE)
         drive[TURN] = (self._noise.gyro * STEP_S) ** 2
         drive[SPEED] = (self._noise.accel * STEP_S) ** 2
         for foot, steps in zip(FEET, self._standing, strict=True):
             walk = SETTLE_WALK if steps * STEP_S < self._settle_s else FOOT_WALK
             drive[foot] = walk**2 * STEP_S
-        self._cov = step @ self._cov @ step.T + np.diag(drive)
+        self._cov = step @ self._cov @ step.T
+        self._cov.flat[:: SIZE + 1] += drive
 
     def _sole_ends(self, joints: np.ndarray) -> np.ndarray:
         """Toe and heel (2, 2, 3) of both feet in the trunk's frame."""
@@ -199,7 +203,7 @@ class Estimator:
     def _correct(self, side: int, arm: np.ndarray) -> None:
         """The foot has not moved: what the leg says against where it should be."""
         sense = -_end_of(arm)
-        sense[:, FEET[side]] = np.eye(3)
+        sense[:, FEET[side]] = UNIT
         missed = arm - (self._x[FEET[side]] - self._x[PLACE])
         seen = self._cov @ sense.T  # (SIZE, 3)
         gain = np.linalg.solve(sense @ seen + self._leg, seen.T).T
@@ -215,6 +219,6 @@ def _end_of(arm: np.ndarray) -> np.ndarray:
     trunk, world axes.
     """
     sense = np.zeros((3, SIZE))
-    sense[:, PLACE] = np.eye(3)
+    sense[:, PLACE] = UNIT
     sense[:, TURN] = -pin.skew(arm)
     return sense

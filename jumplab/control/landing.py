@@ -35,6 +35,9 @@ STOP_LEAVE = 10.0  # [rad/s^2] ... and if it is wished elsewhere, at least so mu
 # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
 MAX_SHIFT = 60.0
 MAX_TURN = 300.0
+# [rad/s] a joint goes back to the stance: from far off it would be asked for an acceleration that
+# the CoM pays for, three radians of an arm for all that the heels can hold
+MAX_BACK = 3.0
 MAX_STEP = 150.0  # [m/s^2] of a foot that steps: 0.5 m in 0.24 s begin with 50
 # [0.1 mN m] ProxQP's last digits depend on where its memory lies; rounded, runs are the same
 TORQUE_DIGITS = 4
@@ -56,12 +59,13 @@ class LandingGains:
     trunk_rate: float = 7.0
     foot_rate: float = 25.0
     posture_rate: float = 8.0
-    # z: a late push meets the end of the knee's stroke
-    com_weight: tuple[float, float, float] = (30.0, 10.0, 30.0)
+    # x: once the pressure is at a sole's edge, only trunk and arms still catch the robot; z: a late
+    # push meets the end of the knee's stroke
+    com_weight: tuple[float, float, float] = (150.0, 10.0, 30.0)
     momentum_weight: float = 0.5  # of L-rate over a nominal inertia, hence also rad/s^2
     trunk_weight: float = 0.5
     foot_weight: float = 20.0  # of a foot that stands, or takes a recovery step
-    foot_turning_weight: float = 0.5
+    foot_turning_weight: float = 4.0  # or heels rise as ankles turn back from their stops
     swing_weight: float = 1.0  # of one that is to come down
     swing_turning_weight: float = 0.05
     arm_posture_weight: float = 0.02
@@ -104,6 +108,7 @@ class LandingController:
         self.gains = body.size.scaled(GAINS, UNITS)
         self._horizon_s = body.size.of(STOP_HORIZON_S, "s")
         self._most_turn = body.size.of(MAX_TURN, "rad/s^2")
+        self._most_back = body.size.of(MAX_BACK, "rad/s")
         self.step = RecoveryStep(robot, SOLE_SHARE, force_noise_n)
         self.solver = solver()
         self._loaded_n = max(body.size.of(CONTACT_FORCE_N, "N"), LIKELY * force_noise_n)
@@ -114,6 +119,8 @@ class LandingController:
         self._posture_weight = np.where(arms, g.arm_posture_weight, legs_weight)
         self._corners = corner_rows(robot, PLANNED_FRICTION, *SOLE_SHARE)
         self._last_contact = np.full(2, -np.inf)
+        # [m] height of the lowest sole that was loaded last; it begins when one is
+        self._ground = np.inf
         # accelerations, wrenches, and what these differ by
         left, right = body.unknowns[-12:-6], body.unknowns[-6:]
         self._effort_rows = np.vstack([body.unknowns, left - right])
@@ -149,17 +156,16 @@ class LandingController:
 
     def standing(self, time: float, foot_force: np.ndarray) -> np.ndarray:
         """Which feet (2,) may carry weight: those whose ``foot_force`` (2,) [N] did a moment before
-        ``time`` [s], and any that hovers just beside one.
+        ``time`` [s], and any that hovers just over the ground that the last one met.
         """
         self._last_contact[foot_force > self._loaded_n] = time
         if self.step.side is not None:
             return np.arange(2) != self.step.side
         loaded = time - self._last_contact <= CONTACT_HOLD_S
-        if not loaded.any():
-            return loaded
-        body = self.body
-        height = body.soles[:, 2]
-        return loaded | (height - height[loaded].min() < body.size.of(NEAR_GROUND_M, "m"))
+        height = self.body.soles[:, 2]
+        if loaded.any():
+            self._ground = height[loaded].min()
+        return loaded | (height - self._ground < self.body.size.of(NEAR_GROUND_M, "m"))
 
     def _program(self, time: float, q: np.ndarray, v: np.ndarray, contact: np.ndarray) -> Qp:
         """The QP of one moment."""
@@ -175,7 +181,7 @@ class LandingController:
         body.balance(qp, com_wish, momentum_wish, weights)
         qp.cost("trunk", body.unknowns[3:6], self._trunk_wish(v), g.trunk_weight)
         for side in (0, 1):
-            wish = self._foot_wish(side, contact[side], ground[:, 2].min())
+            wish = self._foot_wish(side, contact[side])
             weight = g.foot_weight, g.foot_turning_weight
             if side == self.step.side:
                 wish[:3] = np.clip(self.step.foot_acceleration(time, body), -MAX_STEP, MAX_STEP)
@@ -210,7 +216,7 @@ class LandingController:
         goal = pin.rpy.rpyToMatrix(0.0, self._rest_pitch, np.arctan2(trunk[1, 0], trunk[0, 0]))
         return rate**2 * pin.log3(trunk.T @ goal) - 2 * rate * v[3:6]
 
-    def _foot_wish(self, side: int, standing: bool, ground_height: float) -> np.ndarray:
+    def _foot_wish(self, side: int, standing: bool) -> np.ndarray:
         """Acceleration (6,) of a sole: flat and still; a foot in the air is also led down to the
         ground.
         """
@@ -222,7 +228,7 @@ class LandingController:
         wish[3:] += rate**2 * pin.log3(goal @ attitude.T)
         if not standing:
             wish[:2] += 2 * rate * body.com_velocity[:2]
-            wish[2] += rate**2 * (ground_height - body.soles[side, 2])
+            wish[2] += rate**2 * (self._ground - body.soles[side, 2])
         most = np.repeat([MAX_SHIFT, self._most_turn], 3)
         return np.clip(wish, -most, most)
 
@@ -232,7 +238,8 @@ class LandingController:
         """
         rate = self.gains.posture_rate
         motors = self.body.motors
-        wish = rate**2 * (self._rest - q[7:]) - 2 * rate * v[6:]
+        back = np.clip(rate / 2 * (self._rest - q[7:]), -self._most_back, self._most_back)
+        wish = 2 * rate * (back - v[6:])
         weight = self._posture_weight.copy()
         leave = self.body.size.of(STOP_LEAVE, "rad/s^2")
         ahead = q[7:] + v[6:] * self._horizon_s

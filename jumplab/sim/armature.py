@@ -47,6 +47,9 @@ class Armature:
                 for link in bodies:
                     self.lent[link] = self.lent.get(link, 0.0) + armature
                 self._motors.append((*bodies, armature * slope[3:, column], column))
+        # views of Pinocchio's own numbers, which are new after each of its passes
+        self._turns = {link: self._data.oMi[joint].rotation for link, joint in self._joints.items()}
+        self._twists = [twist.angular for twist in self._data.v]
 
     def returned(self, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
         """Torque (3,) for each link, world axes, in the step that begins at ``q`` (nq,) and ``v``
@@ -54,7 +57,7 @@ class Armature:
         now = self._spins(q, v), v
         change, rate = ((x - y) / STEP_S for x, y in zip(now, self._last or now, strict=True))
         self._last = now
-        turns = {link: self._data.oMi[joint].rotation for link, joint in self._joints.items()}
+        turns = self._turns
         out = {
             link: turns[link] @ (self.lent[link] * change[k]) for link, k in self._joints.items()
         }
@@ -67,7 +70,7 @@ class Armature:
     def _spins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Angular velocities (joints, 3) of all bodies in their joints' axes."""
         pin.forwardKinematics(self._model, self._data, q, v)
-        return np.array([twist.angular for twist in self._data.v])
+        return np.array(self._twists)
 
     def late(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Generalised forces (N - 1, nv) that acted because of the delay, from a log (N, nq), (N,

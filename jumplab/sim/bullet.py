@@ -199,6 +199,7 @@ class BulletEngine(Engine):
             change(link, localInertiaDiagonal=[x + self._armature.lent[name] for x in inertia])
 
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
+        self._now: tuple[np.ndarray, np.ndarray] | None = None
         self._friction = Friction(self.robot, q)
         self._torque = np.zeros(len(self._joints))
         position, quaternion, velocity, rate = base_to_bullet(q, v, self._lever)
@@ -239,6 +240,12 @@ class BulletEngine(Engine):
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""
+        if self._now is None:
+            self._now = self._read()
+        q, v = self._now
+        return q.copy(), v.copy()
+
+    def _read(self) -> tuple[np.ndarray, np.ndarray]:
         pose = self._bullet.getBasePositionAndOrientation(self._body)
         twist = self._bullet.getBaseVelocity(self._body)
         base_q, base_v = base_from_bullet(*(np.array(x) for x in (*pose, *twist)), self._lever)
@@ -274,6 +281,7 @@ class BulletEngine(Engine):
             self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau
         )
         self._bullet.stepSimulation()
+        self._now = None
 
     def applied(self) -> np.ndarray:
         """Torque that the motors gave in the last step (nv - 6,) [N m], as they were told: PyBullet
