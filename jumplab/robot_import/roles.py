@@ -7,7 +7,7 @@ Which joint is which is found from how it moves its links, never from its name.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, takewhile
 from pathlib import Path
@@ -375,13 +375,26 @@ def _assumed(
 
 def leg_joints(tree: Tree, trunk: str, feet: tuple[str, str]) -> list[str]:
     """Names of the driven joints between a trunk and both feet (left, right)."""
-    return [j.name for foot in feet for j in tree.path_between(trunk, foot) if j.driven]
+    legs = [j for foot in feet for j in tree.path_between(trunk, foot)]
+    _check_leaders(tree, legs)
+    return [j.name for j in legs if j.driven]
+
+
+def _check_leaders(tree: Tree, legs: Iterable[Joint]) -> None:
+    """Raise if a joint of a leg follows one that is missing; elsewhere such a joint is held."""
+    for joint in legs:
+        if joint.mimic and joint.mimic[0] not in tree.joints:
+            raise tree.error(
+                f"joint {joint.name!r} mimics {joint.mimic[0]!r}, which does not exist; correct "
+                f"the name"
+            )
 
 
 def _explain(tree: Tree) -> NoReturn:
     """Raise with the reason why there are no two legs."""
     finders = (_Finder(tree, guess, every_kind=True) for guess in GUESSES)
     legs = next((finder.legs for finder in finders if finder.legs), [])
+    _check_leaders(tree, (joint for _, chain in legs for joint in chain))
     for three, _ in legs:
         for role, joint in zip(LEG, three, strict=True):
             if not joint.driven:
