@@ -69,6 +69,18 @@ def test_canted_shoulders_are_held_and_said():
     assert roles.notes[0].startswith("the arms are held: the first joint, 'right_shoulder_pitch', turns 16.0 deg off")
 
 
+def test_antennas_are_no_arms():
+    robot = root()
+    for side in ("left", "right"):
+        link(robot, f"{side}_arm").find("inertial/mass").set("value", "0.3")
+    roles = find_roles(tree(robot))
+    assert roles.joints["shoulder_pitch"] == ()
+    assert roles.notes[0] == (
+        "the arms are held: what the joint 'right_shoulder_pitch' swings weighs 0.8% of the robot"
+    )
+    assert find_roles(tree(root())).joints["shoulder_pitch"] == ("left_shoulder_pitch", "right_shoulder_pitch")
+
+
 def with_knees(change) -> ET.Element:
     """The default robot with both knees changed."""
     robot = root()

@@ -37,6 +37,7 @@ SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
 PARALLEL = 0.999
 # share of the robot's height within which the ankles are above the lowest joint: arms end higher
 LOWEST = 0.15
+LIGHT_ARM = 0.01  # share of the robot's mass: lighter ones, such as antennas, swing nothing
 # a range as even as this says nothing of where the robot faces
 EVEN_RAD = 0.3
 # nor do feet that reach less farther ahead than behind, as a share of the leg's length
@@ -299,6 +300,13 @@ class _Finder:
             notes.append("no arms were found: the shoulder is left out")
             return ()
         pair = tuple(chain[0] for chain in arms)
+        share = max(self.tree.carried(joint.child) for joint in pair) / self.tree.mass
+        if share < LIGHT_ARM:
+            notes.append(
+                f"the arms are held: what the joint {pair[0].name!r} swings weighs {share:.1%} of "
+                f"the robot"
+            )
+            return ()
         cosine = min(map(self.turning, pair))
         if cosine > PARALLEL:
             return pair
