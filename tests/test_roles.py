@@ -81,6 +81,18 @@ def test_antennas_are_no_arms():
     assert find_roles(tree(root())).joints["shoulder_pitch"] == ("left_shoulder_pitch", "right_shoulder_pitch")
 
 
+def test_fingers_are_no_feet():
+    """The hand of a robot without legs has three joints about the pitch axis below each shoulder."""
+    robot = root()
+    for side in ("left", "right"):
+        for name in ("ankle_link", "foot"):
+            inertial = link(robot, f"{side}_{name}").find("inertial")
+            inertial.find("mass").set("value", "0.004")
+            for key in ("ixx", "iyy", "izz"):
+                inertial.find("inertia").set(key, "1e-6")
+    assert "no pair of mirrored legs" in refused(lambda: find_roles(tree(robot)))
+
+
 def with_knees(change) -> ET.Element:
     """The default robot with both knees changed."""
     robot = root()

@@ -37,6 +37,8 @@ SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
 PARALLEL = 0.999
 # share of the robot's height within which the ankles are above the lowest joint: arms end higher
 LOWEST = 0.15
+# of what the hip carries: lighter ones are fingers of an arm; feet have 6 % or more
+LIGHT_FOOT = 0.002
 LIGHT_ARM = 0.01  # share of the robot's mass: lighter ones, such as antennas, swing nothing
 # a range as even as this says nothing of where the robot faces
 EVEN_RAD = 0.3
@@ -193,8 +195,11 @@ class _Finder:
         return float(norm(hip - ankle))
 
     def along(self, three: tuple[Joint, ...]) -> bool:
-        """True if the leg hangs (from hip to ankle), and ends where the robot does."""
+        """True if the leg hangs (from hip to ankle), and ends where the robot does, on a foot."""
         if not three:
+            return False
+        leg, _, foot = (self.tree.carried(joint.child) for joint in three)
+        if 0 < foot < LIGHT_FOOT * leg:
             return False
         hip, _, ankle = (self.at[joint] for joint in three)
         heights = np.array([*self.at.values()]) @ self.up
