@@ -61,7 +61,8 @@ class SolverError(JumplabError):
 
     ``stage`` names the stage that failed, ``status`` is what the solver said after how many
     ``iterations``, and ``violations`` are the worst violated terms, each as "name: amount unit at
-    node k, t = ... s".
+    node k, t = ... s". ``limits`` are those that hold back the best compromise, if one was looked
+    for, as :func:`jumplab.ocp.posing.binding` has them.
     """
 
     exit_code = 3
@@ -74,12 +75,14 @@ class SolverError(JumplabError):
         status: str = "",
         violations: tuple[str, ...] = (),
         iterations: int = 0,
+        limits: tuple = (),
     ):
         super().__init__(message)
         self.stage = stage
         self.status = status
         self.violations = violations
         self.iterations = iterations
+        self.limits = limits
 
 
 def quoted(value: Any) -> str:

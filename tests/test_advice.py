@@ -47,6 +47,14 @@ def refused(task, monkeypatch, planner):
     return e.value
 
 
+def test_an_easier_target_is_never_higher(monkeypatch):
+    """Small robots are asked for less than the least height that is tried for others."""
+    fake = Fake()
+    e = refused(JumpTask(2.0, 0.025), monkeypatch, fake)
+    assert {task.height_m for task in fake.asked} == {0.025} and len(fake.asked) > 2
+    assert str(e).endswith("; ask for a distance of 0.43 m, which has a plan")
+
+
 def raised(call, *given):
     try:
         call(*given)

@@ -238,10 +238,14 @@ def test_small_differences_of_the_sides_are_evened_out():
 
 
 def test_differences_of_a_light_body_count_little():
-    """10 % of the inertia of a gram do not keep a robot of 42 kg from being even; those of a shank do."""
-    for name, inertia, done in (("left_hip_yaw_link", "1.1e-06", True), ("left_shank", "0.035", False)):
+    """10 % of the inertia of a gram do not keep a robot of 42 kg from being even; five times a shank's do."""
+    for name, key, inertia, done in (
+        ("left_hip_yaw_link", "iyy", "1.1e-06", True),
+        ("left_shank", "iyy", "0.038", True),
+        ("left_shank", "izz", "0.012", False),
+    ):
         robot = root()
-        link(robot, name).find("inertial/inertia").set("iyy", inertia)
+        link(robot, name).find("inertial/inertia").set(key, inertia)
         _, lumped = make_jumper(read_tree(text(robot), "my.urdf"), read_toml(config("x"), "config"))
         changed = lumped.changed
         assert any("differ, left as they are" in said for said in changed) is not done, (name, changed)

@@ -69,6 +69,30 @@ def test_canted_shoulders_are_held_and_said():
     assert roles.notes[0].startswith("the arms are held: the first joint, 'right_shoulder_pitch', turns 16.0 deg off")
 
 
+def test_antennas_are_no_arms():
+    robot = root()
+    for side in ("left", "right"):
+        link(robot, f"{side}_arm").find("inertial/mass").set("value", "0.3")
+    roles = find_roles(tree(robot))
+    assert roles.joints["shoulder_pitch"] == ()
+    assert roles.notes[0] == (
+        "the arms are held: what the joint 'right_shoulder_pitch' swings weighs 0.8% of the robot"
+    )
+    assert find_roles(tree(root())).joints["shoulder_pitch"] == ("left_shoulder_pitch", "right_shoulder_pitch")
+
+
+def test_fingers_are_no_feet():
+    """The hand of a robot without legs has three joints about the pitch axis below each shoulder."""
+    robot = root()
+    for side in ("left", "right"):
+        for name in ("ankle_link", "foot"):
+            inertial = link(robot, f"{side}_{name}").find("inertial")
+            inertial.find("mass").set("value", "0.004")
+            for key in ("ixx", "iyy", "izz"):
+                inertial.find("inertia").set(key, "1e-6")
+    assert "no pair of mirrored legs" in refused(lambda: find_roles(tree(robot)))
+
+
 def with_knees(change) -> ET.Element:
     """The default robot with both knees changed."""
     robot = root()
@@ -110,12 +134,23 @@ def one_leg() -> ET.Element:
     return robot
 
 
+def led_by_nobody(name: str) -> ET.Element:
+    """The default robot with both joints of a leg led by joints that it lacks."""
+    robot = root()
+    for side in ("left", "right"):
+        ET.SubElement(joint(robot, f"{side}_{name}"), "mimic", joint="motor")
+    return robot
+
+
+NOBODY = "mimics 'motor', which does not exist; correct the name"
 PLACE = "but has the place of a knee, which must be revolute with a range and a motor of its own"
 SENTENCES = [
     (with_knee("fixed"), f"my.urdf: joint 'right_knee' is of type 'fixed', {PLACE}"),
     (with_knees(weak), f"my.urdf: joint 'right_knee' has effort = 0 N m, {PLACE}"),
     (with_knee("prismatic"), f"my.urdf: joint 'right_knee' is of type 'prismatic', {PLACE}"),
     (with_knees(coupled), f"my.urdf: joint 'right_knee' mimics 'right_hip_pitch', {PLACE}"),
+    (led_by_nobody("knee"), f"my.urdf: joint 'right_knee' {NOBODY}"),
+    (led_by_nobody("hip_yaw"), f"my.urdf: joint 'left_hip_yaw' {NOBODY}"),
     (one_leg(), "my.urdf: one leg only: the chain that ends with joint 'left_ankle_roll' has no mirror image among 9 "
                 "links; a jumper needs two legs"),
     (with_knees(stiff), "my.urdf: no pair of mirrored legs with three revolute pitch joints (hip, knee, ankle) was "
@@ -123,7 +158,10 @@ SENTENCES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("robot", "sentence"), SENTENCES, ids=["fixed", "torque", "prismatic", "mimic", "one", "none"])
+SENTENCE_IDS = ["fixed", "torque", "prismatic", "mimic", "nobody's knee", "nobody's yaw", "one", "none"]
+
+
+@pytest.mark.parametrize(("robot", "sentence"), SENTENCES, ids=SENTENCE_IDS)
 def test_legs_that_are_no_legs(robot, sentence):
     assert refused(lambda: find_roles(tree(robot))) == sentence
 
@@ -175,6 +213,25 @@ def test_hips_that_are_coupled_are_held(tmp_path):
     assert found.roles.notes == ("joint 'right_hip_yaw' follows 'left_hip_yaw': held",)
     moving = set(check(path, found.text).robot.joint_names)
     assert not moving & {"left_hip_yaw", "right_hip_yaw"} and {"left_hip_roll", "right_hip_roll"} <= moving
+
+
+def test_a_finger_that_follows_nobody_is_held(tmp_path):
+    """Hands are held anyway: the name that is missing is said, and the robot is read."""
+    robot = root()
+    finger = ET.SubElement(robot, "link", name="finger")
+    inertial = ET.SubElement(finger, "inertial")
+    ET.SubElement(inertial, "mass", value="0.01")
+    ET.SubElement(inertial, "inertia", ixx="1e-6", ixy="0", ixz="0", iyy="1e-6", iyz="0", izz="1e-6")
+    bend = ET.SubElement(robot, "joint", name="finger_bend", type="revolute")
+    for end, name in (("parent", "left_arm"), ("child", "finger")):
+        ET.SubElement(bend, end, link=name)
+    ET.SubElement(bend, "origin", xyz="0 0 -0.4")
+    ET.SubElement(bend, "limit", lower="0", upper="1", effort="1", velocity="1")
+    ET.SubElement(bend, "mimic", joint="index_q1", offset="0.5")
+    path, found = drafted(robot, tmp_path)
+    assert found.roles.notes == ("joint 'finger_bend' follows 'index_q1', which does not exist: held",)
+    result = check(path, found.text)
+    assert result.lumped.held == {"finger_bend": 0.5} and "finger_bend" not in result.robot.joint_names
 
 
 def test_a_foot_beside_its_pitch_axis_origin_keeps_its_width(tmp_path):

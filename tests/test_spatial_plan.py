@@ -27,6 +27,7 @@ from jumplab.models.spatial import SpatialState
 from jumplab.ocp.nlp import EXPLAINED
 from jumplab.ocp.posing import pack
 from jumplab.ocp.problem import Point
+from jumplab.ocp.solution import PhaseSolution
 from jumplab.robot.stance import configuration, stance_angles
 from jumplab.sim import STEP_S, simulate_jump
 from jumplab.sim.scene import Scene
@@ -649,6 +650,24 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
     beside = [replace(x, first=x.last + 1, last=x.last + 6) for x in found]
     assert merged(found, beside) == tuple(replace(x, last=x.last + 6) for x in found)
     assert merged(apart, ()) == apart
+
+
+@pytest.mark.parametrize(("pitch", "roll", "links", "axis"), [(-2.5, 0.0, "trunk_0 thigh", 0), (-1.7, 0.4, "foot", 1)])
+def test_links_that_meet_are_kept_where_they_were(bhr, pitch, roll, links, axis):
+    """A thigh stays in front of the trunk, and feet beside each other, though in the midst of each other they were
+    less deep behind other faces."""
+    body = Body(bhr)
+    q = np.tile(body.stance, (13, 1))
+    way = np.sin(np.linspace(0, np.pi, 13))
+    for side, sign in (("left", 1), ("right", -1)):
+        q[:, BASE + bhr.joint_names.index(f"{side}_hip_pitch")] += pitch * way
+        q[:, BASE + bhr.joint_names.index(f"{side}_hip_roll")] += sign * roll * way
+    still = np.zeros_like(q)
+    motion = PhaseSolution(np.linspace(0, 1, 13), q, still, still, still[1:], still[:, :1], 1.0, {})
+    pairs = [x.pair for x in too_close(body, [motion], 0.003)]
+    kinds = {f"left_{name}_0" if "_" not in name else name for name in links.split()}
+    found = [pair.face // 2 for pair in pairs if kinds <= {pair.first.name, pair.second.name}]
+    assert found and set(found) == {axis}
 
 
 def test_rows_for_links_that_met_stay_where_they_are_on_another_mesh():

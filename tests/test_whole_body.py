@@ -147,6 +147,24 @@ def test_touchdown(run):
     assert abs(ahead) <= LIMITS.capture_window_m + 1e-3
 
 
+def test_hips_that_hardly_bend_land_on_straighter_knees(bhr):
+    """With hips that stop 0.1 rad from the stance no knee bends as far as it should at touchdown."""
+    robot = bhr.with_limits(joints={"hip_pitch": {"lower": -0.42}})
+    plan = WholeBodyPlanner(robot).plan(JumpTask(0.15, 0.12))
+    knee = plan.phases["flight"].q[-1, 6 + robot.joint_names.index("left_knee")]
+    assert plan.used <= 1 and 0.5 < knee < LIMITS.touchdown_knee[0] - 0.2
+    assert Body(bhr).squat_rad > LIMITS.touchdown_knee[1]  # where hips bend, nothing changes
+
+
+def test_a_refusal_names_the_joints_that_hold_the_jump_back(bhr):
+    robot = bhr.with_limits(speed={"hip": 0.15, "knee": 0.15})
+    with pytest.raises(SolverError, match="violates flight/vertical take-off speed by") as e:
+        WholeBodyPlanner(robot).plan(JumpTask(0.2, 0.3))
+    assert str(e.value).endswith(
+        "held back by the speed of joint 'left_knee', 3 rad/s and the speed of joint 'left_hip_pitch', 2.7 rad/s"
+    )
+
+
 def test_momentum_follows_stage_one(run):
     """L at take-off within one percent of stage 1's, or within the stated slack where there is little of it."""
     if run.plan.srmp is None:  # the direct planner has no reference: its L at take-off is what the flight keeps

@@ -7,7 +7,7 @@ import numpy as np
 
 from jumplab.errors import InputError
 from jumplab.ocp.assembly import Assembled, ipopt, nlp_functions, scatter
-from jumplab.ocp.posing import Posed, unpack
+from jumplab.ocp.posing import Posed, binding, unpack, unpack_multipliers
 
 NAMED = 4  # so many terms are named at most
 CONFLICT_LIMIT = 1e-3  # scaled row error that is worth a word
@@ -18,11 +18,12 @@ ELASTIC |= {"mu_strategy": "adaptive", "nlp_scaling_method": "none", "print_leve
 
 def reasons(
     a: Assembled, posed: Posed, last: np.ndarray, explain: bool, seconds: float = np.inf
-) -> tuple[str, tuple[str, ...]]:
-    """(end of a sentence, terms) about a solve that ended at ``last`` (n,) without a plan.
+) -> tuple[str, tuple[str, ...], tuple]:
+    """(end of a sentence, terms, limits) about a solve that ended at ``last`` (n,) without a plan.
 
     To ``explain`` a conflict costs about as much as a solve, ``seconds`` of processor time at most;
-    else the terms are those that the last iterate violates.
+    else the terms are those that the last iterate violates. The limits, as :func:`.binding` has
+    them, are those of the best compromise.
     """
     for where, x in {"initial guess": posed.x0, "last iterate": last}.items():
         lost = tuple(f"{name}{place}" for name, place in _without_number(a, x, posed.p).items())
@@ -32,18 +33,22 @@ def reasons(
                 f": {named} has no finite value or slope at the {where}; keep the arguments "
                 "of the term where it is defined, or start from another guess",
                 lost,
+                (),
             )
     if not explain:
-        return "", _violated(a, posed, last)
-    worst = _violated(a, posed, _least_violation(a, posed, seconds))
+        return "", _violated(a, posed, last), ()
+    x, *multipliers = _least_violation(a, posed, seconds)
+    worst = _violated(a, posed, x)
     if not worst:
         return (
             ": a motion that meets every constraint exists, but the search did not settle; try "
             "another guess",
             (),
+            (),
         )
     named = "; ".join(worst)
-    return f": the best compromise still violates {named}; these constraints conflict", worst
+    sentence = f": the best compromise still violates {named}; these constraints conflict"
+    return sentence, worst, (*binding(a, posed, unpack_multipliers(a, *multipliers)),)
 
 
 def check_start(a: Assembled, posed: Posed) -> None:
@@ -113,8 +118,9 @@ def _violated(a: Assembled, posed: Posed, x: np.ndarray) -> tuple[str, ...]:
     return tuple(text for _, text in ranked[:NAMED])
 
 
-def _least_violation(a: Assembled, posed: Posed, seconds: float) -> np.ndarray:
-    """The motion (n,) with the least sum of row violations plus a trace of the cost.
+def _least_violation(a: Assembled, posed: Posed, seconds: float) -> tuple[np.ndarray, ...]:
+    """The motion (n,) with the least sum of row violations plus a trace of the cost, and the
+    multipliers of its bounds (n,) and rows (n_rows,).
 
     Identities, which say only that the motion is one motion, stay hard.
     """
@@ -148,4 +154,6 @@ def _least_violation(a: Assembled, posed: Posed, seconds: float) -> np.ndarray:
         "ubx": np.concatenate([posed.box[1], np.full(2 * m, np.inf)]),
     }
     options = ELASTIC | {"max_cpu_time": min(ELASTIC["max_cpu_time"], seconds)}
-    return ipopt(functions, options)(**arguments)["x"].full().ravel()[:n]
+    answer = ipopt(functions, options)(**arguments)
+    found, lam_x, lam_g = (answer[key].full().ravel() for key in ("x", "lam_x", "lam_g"))
+    return found[:n], lam_x[:n], lam_g

@@ -183,13 +183,14 @@ class Nlp:
             residual = float(np.max(posed.beyond(g), initial=0.0))
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
             asked = explain and EXPLAINED.get()
-            because, violations = reasons(a, posed, x, asked and left_s() > 0, left_s())
+            because, violations, limits = reasons(a, posed, x, asked and left_s() > 0, left_s())
             raise SolverError(
                 f"{self.problem.name}: no plan ({status} after {iterations} iterations){because}",
                 stage=self.problem.name,
                 status=status,
                 violations=violations,
                 iterations=iterations,
+                limits=limits,
             )
         statistics = Statistics(
             iterations=iterations,

@@ -121,7 +121,8 @@ def notes(tree: Tree) -> Iterator[str]:
         if joint.mimic:
             followers.setdefault(joint.mimic[0], []).append(joint.name)
     for leader, names in followers.items():
-        yield f"{_joints(names, 'follows', 'follow')} {leader!r}: held"
+        lost = "" if leader in tree.joints else ", which does not exist"
+        yield f"{_joints(names, 'follows', 'follow')} {leader!r}{lost}: held"
     still = [joint.name for joint in moving if joint.limits.get("effort") == 0 and not joint.mimic]
     if still:
         yield f"{_joints(still, 'has', 'have')} no motor (effort = 0): held"
@@ -211,14 +212,11 @@ def _joint_faults(joint: ET.Element, links: set, where: str) -> Iterator[str]:
 
 
 def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[str]:
-    known = {j.get("name") for j in joints}
     for joint in joints:
         mimic = joint.find("mimic")
         at = f"{where}: joint {joint.get('name')!r}"
         if mimic is None:
             continue
-        if mimic.get("joint") not in known:
-            yield f"{at} mimics {mimic.get('joint')!r}, which does not exist; correct the name"
         for key in ("multiplier", "offset"):
             if numbers(mimic.get(key, "0"), 1) is None:
                 yield f"{at}: mimic {key} = {mimic.get(key)!r} must be a finite number"

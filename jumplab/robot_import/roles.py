@@ -7,7 +7,7 @@ Which joint is which is found from how it moves its links, never from its name.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, takewhile
 from pathlib import Path
@@ -37,6 +37,9 @@ SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
 PARALLEL = 0.999
 # share of the robot's height within which the ankles are above the lowest joint: arms end higher
 LOWEST = 0.15
+# of what the hip carries: lighter ones are fingers of an arm; feet have 6 % or more
+LIGHT_FOOT = 0.002
+LIGHT_ARM = 0.01  # share of the robot's mass: lighter ones, such as antennas, swing nothing
 # a range as even as this says nothing of where the robot faces
 EVEN_RAD = 0.3
 # nor do feet that reach less farther ahead than behind, as a share of the leg's length
@@ -192,8 +195,11 @@ class _Finder:
         return float(norm(hip - ankle))
 
     def along(self, three: tuple[Joint, ...]) -> bool:
-        """True if the leg hangs (from hip to ankle), and ends where the robot does."""
+        """True if the leg hangs (from hip to ankle), and ends where the robot does, on a foot."""
         if not three:
+            return False
+        leg, _, foot = (self.tree.carried(joint.child) for joint in three)
+        if 0 < foot < LIGHT_FOOT * leg:
             return False
         hip, _, ankle = (self.at[joint] for joint in three)
         heights = np.array([*self.at.values()]) @ self.up
@@ -299,6 +305,13 @@ class _Finder:
             notes.append("no arms were found: the shoulder is left out")
             return ()
         pair = tuple(chain[0] for chain in arms)
+        share = max(self.tree.carried(joint.child) for joint in pair) / self.tree.mass
+        if share < LIGHT_ARM:
+            notes.append(
+                f"the arms are held: what the joint {pair[0].name!r} swings weighs {share:.1%} of "
+                f"the robot"
+            )
+            return ()
         cosine = min(map(self.turning, pair))
         if cosine > PARALLEL:
             return pair
@@ -375,13 +388,26 @@ def _assumed(
 
 def leg_joints(tree: Tree, trunk: str, feet: tuple[str, str]) -> list[str]:
     """Names of the driven joints between a trunk and both feet (left, right)."""
-    return [j.name for foot in feet for j in tree.path_between(trunk, foot) if j.driven]
+    legs = [j for foot in feet for j in tree.path_between(trunk, foot)]
+    _check_leaders(tree, legs)
+    return [j.name for j in legs if j.driven]
+
+
+def _check_leaders(tree: Tree, legs: Iterable[Joint]) -> None:
+    """Raise if a joint of a leg follows one that is missing; elsewhere such a joint is held."""
+    for joint in legs:
+        if joint.mimic and joint.mimic[0] not in tree.joints:
+            raise tree.error(
+                f"joint {joint.name!r} mimics {joint.mimic[0]!r}, which does not exist; correct "
+                f"the name"
+            )
 
 
 def _explain(tree: Tree) -> NoReturn:
     """Raise with the reason why there are no two legs."""
     finders = (_Finder(tree, guess, every_kind=True) for guess in GUESSES)
     legs = next((finder.legs for finder in finders if finder.legs), [])
+    _check_leaders(tree, (joint for _, chain in legs for joint in chain))
     for three, _ in legs:
         for role, joint in zip(LEG, three, strict=True):
             if not joint.driven:

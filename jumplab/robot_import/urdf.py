@@ -333,8 +333,8 @@ class Tree:
         self.mended = np.inf if repair_inertia else slight(root)
         self._build()
         for follower in [j for j in self.joints.values() if j.mimic]:
-            leader = self.joints[follower.mimic[0]]
-            if leader in self.chain(follower.child):
+            leader = self.joints.get(follower.mimic[0])
+            if leader is None or leader in self.chain(follower.child):
                 continue
             if self.carried(leader.child) < GEAR_SHARE * self.carried(follower.child):
                 self._gear(leader, follower)

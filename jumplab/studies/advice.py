@@ -184,8 +184,10 @@ def _milder(task: JumpTask, tried: int) -> dict[str, float]:
         return {"distance_m": 0.0, "platform_m": 0.0}
     if task.rotation_rad and tried > 1:
         return {"rotation_rad": 0.0}
-    if tried % 2 or (task.distance_m == 0 and task.in_plane):
-        return {"height_m": max(_milder_m(MILDER, task.height_m), LEAST_M)}
+    height = max(_milder_m(MILDER, task.height_m), LEAST_M)
+    # small robots are asked for less than that
+    if height < task.height_m and (tried % 2 or (task.distance_m == 0 and task.in_plane)):
+        return {"height_m": height}
     return {
         "distance_m": _milder_m(MILDER, task.distance_m),
         "side_m": _milder_m(MILDER, task.side_m),

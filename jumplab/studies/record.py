@@ -20,18 +20,18 @@ from jumplab.auditing import AuditReport
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
-from jumplab.ocp.problem import Phase, Term
+from jumplab.ocp.problem import Term
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits, Mesh, bounds
 from jumplab.stages.whole_body.body import Body
-from jumplab.stages.whole_body.mode import held_joints
+from jumplab.stages.whole_body.limiting import limit_of
 from jumplab.stages.whole_body.problem import SOUGHT
 from jumplab.stages.whole_body.program import Program, Solved
 from jumplab.stages.whole_body.starts import RECORD, SEEKING, Asked
-from jumplab.stages.whole_body.terms import HOLDING, TORQUE_SPEED, WORTH
+from jumplab.stages.whole_body.terms import WORTH
 from jumplab.studies.advice import keep_record
 from jumplab.studies.prices import Prices, priced
 from jumplab.task import RANGES, JumpTask
@@ -405,7 +405,7 @@ def _binding(program: Program, task: JumpTask, solved: Solved) -> list[Binding]:
     for (owner, term), column, share, lam, limit in program.limits_of(Asked(task), solved):
         worth = lam * np.where(np.isfinite(limit), np.abs(limit), 0.0) / WORTH
         for way in (1, -1):
-            key = owner in phases and _limit(phases[owner], program, term, column, way)
+            key = owner in phases and limit_of(phases[owner], program, term, column, way)
             if key and (way * worth > 0).any():
                 found.setdefault((owner, *key), []).append((share, np.maximum(way * worth, 0.0)))
     rows = []
@@ -417,28 +417,3 @@ def _binding(program: Program, task: JumpTask, solved: Solved) -> list[Binding]:
         if worth.sum() > BINDS:
             rows.append(Binding(owner, limit, joint, first, last, float(worth.sum())))
     return sorted(rows, key=lambda row: -row.worth)
-
-
-def _limit(
-    phase: Phase, program: Program, term: str, column: int, way: int
-) -> tuple[str, str] | None:
-    """A limit in words and its joint, upper or lower (``way`` 1, -1); None for those of numbers
-    that nobody has set.
-    """
-    if term == "bounds of constants":
-        return (f"duration of {phase.name}", "") if column == 0 else None
-    if term == TORQUE_SPEED:
-        return term, program.body.joint_names[program.free.joints[column]]
-    if term == HOLDING:
-        held, locked = held_joints(program.body, program.free)
-        names = [program.body.joint_names[k] for k in held] + [x.name for x in locked]
-        return "torque", names[column]
-    if term != "bounds of nodes":
-        return term, ""
-    count = len(phase.coordinates)
-    if column < 3 * count:
-        kind = ("upper stop" if way > 0 else "lower stop", "speed", None)[column // count]
-        return kind and (kind, phase.coordinates[column % count])
-    name = phase.states[column - 3 * count]
-    _, of, joint = name.partition("torque of ")
-    return ("torque", joint) if of else None

@@ -46,8 +46,7 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
         near = np.flatnonzero((gaps.max(axis=0) < least_m) & ((phase > 0) | (node >= 1)))
         met = [row for row in near if _distance(body, number, configurations[row]) < least_m]
         for rows in runs(np.array(met, int), 2 * NODES * SAMPLES):
-            # one face, or neighbouring phases ask for two
-            face = int(np.argmax(gaps[:, rows].min(axis=1)))
+            face = _face(gaps, rows, least_m)  # one, or neighbouring phases ask for two
             ends = (one[0], other[0]) if face < 6 else (other[0], one[0])
             pair = Pair(*ends, face % 6)
             for part in np.unique(phase[rows]):
@@ -57,6 +56,20 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
                 if first <= end:
                     out.append(Apart(int(part), first, end, pair))
     return out
+
+
+def _face(gaps: np.ndarray, rows: np.ndarray, least_m: float) -> int:
+    """The face that keeps two boxes apart where they meet, in ``rows`` of its ``gaps`` (12, n).
+
+    It is one that does so before and after, if there is one: a thigh that is drawn up to the trunk
+    stays below it, though beside it the way out is shorter.
+    """
+    clear = gaps >= least_m
+    free = np.flatnonzero(clear.any(axis=0))
+    around = [*free[free < rows[0]][-1:], *free[free > rows[-1]][:1]]
+    may = clear[:, around].all(axis=1)
+    least = gaps[:, rows].min(axis=1)
+    return int(np.argmax(np.where(may, least, -np.inf) if may.any() else least))
 
 
 def placed(body: Body, configurations: np.ndarray) -> list[Placed]:

@@ -85,6 +85,22 @@ class Body:
         return low, high
 
     @cached_property
+    def squat_rad(self) -> float:
+        """Flexion of the knees to which the hips' stops let the robot squat: hips turn by half of
+        what the knees do, from the stance.
+        """
+        turned = self.stance[BASE:]
+        bent = min(sign * turned[k] + angle for k, sign, angle in self.knees)
+        rooms = []
+        for name, sign in zip(
+            self.robot.joints["hip_pitch"], self.robot.sagittal.signs[0], strict=True
+        ):
+            k = self.joint_names.index(name)
+            stops = sign * self.motors.lower[k], sign * self.motors.upper[k]
+            rooms.append(sign * turned[k] - min(stops))
+        return float(bent + 2 * min(rooms))
+
+    @cached_property
     def leg_m(self) -> float:
         """Length l of the legs in the stance [m]."""
         return leg_length(self.robot)

@@ -23,6 +23,7 @@ from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import Contacts, jump_contacts
 from jumplab.stages.whole_body.coordinates import Coordinates, even, in_plane, whole
+from jumplab.stages.whole_body.limiting import held_back
 from jumplab.stages.whole_body.motions import Motion, configurations
 from jumplab.stages.whole_body.plan import WholeBodyPlan
 from jumplab.stages.whole_body.program import Program, Solved
@@ -304,7 +305,8 @@ class WholeBodyPlanner:
         try:
             program.solve(replace(asked, attempts=[]), start, explain=True)
         except SolverError as e:
-            return e
+            held = held_back(program, e)
+            return SolverError(f"{e}; held back by {held}", **vars(e)) if held else e
         return None
 
     def _check_standing(self, task: JumpTask, stance: np.ndarray | None) -> None:

@@ -31,6 +31,8 @@ SOLE_SHARES = 0.0, 0.25, 0.5, 0.75, 1.0  # of the way from toes to heel
 TORSION_SLACK_M = 1e-4  # where a foot hardly carries both sides of the row vanish
 CAPTURE = "replaces WF-E2"
 TORQUE_SPEED = "torque-speed"  # the term of the motors' lines
+# of the knees at touchdown, kept from where the hips stop them: a landing sinks
+SQUAT_ROOM_RAD = 0.15
 HOLDING = "torques of held joints"  # the term of :func:`.held_joints`
 RECORD = "record"  # the term of what is largest
 FAR = 100.0  # [m, m/s, rad] beyond any of it, so that its cost is nearly a straight line
@@ -418,13 +420,15 @@ def touchdown_rows(m: Mode) -> list[Term]:
     def takeoff(p):
         return p.c.vel_z - p.p.takeoff_speed
 
+    # hips that hardly bend let a robot squat less than a landing should have
+    bent = min(lim.touchdown_knee[0], body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
     trunk = rates_within(m, lim.touchdown_trunk_rate, np.eye(3)[0][angles])
     rate = lim.touchdown_joint_rate
     return [
         Term("vertical take-off speed", "SL-E2, WL-E1", "m/s", "start", takeoff),
         *touchdown_feet(m),
         end("attitude at touchdown", "ours", "rad", attitude, low, high),
-        end("knees at touchdown", "ours: stroke", "rad", knees, *lim.touchdown_knee),
+        end("knees at touchdown", "ours: stroke", "rad", knees, *bent),
         end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.rates, -rate, rate),
         end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[free.turns], *trunk),
         *upright_waist(m),
