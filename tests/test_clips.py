@@ -194,7 +194,7 @@ def test_engines_that_do_not_agree_leave_a_clip_out(world, tmp_path, capsys):
 
 
 def test_a_clip_is_the_jump_in_the_first_mode_in_which_the_engines_agree(world, tmp_path):
-    """Where drives that hold angles do not land alike, those that measure the base may; its row and its page say so."""
+    """Drives that hold angles may land differently where those that measure the base do not; row and page say which."""
     world.say = lambda engine, mode: {"touchdown_s": 1.507} if (engine, mode) == ("mujoco", "position") else {}
     found = clips.make_clips(Robot.load(), tmp_path, only=["forward-1"], jobs=1)
     (row,) = found["clips"]

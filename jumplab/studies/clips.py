@@ -314,8 +314,8 @@ def _judged(planner: Planner, task: JumpTask | Contacts, folder: Path) -> Plain:
 
 
 def _played(plan: JumpPlan, mode: str) -> tuple[ModeReport, SimulationResult | None]:
-    """What the engines make of a plan in one mode; and the jump in the default one, None if that
-    lost the robot.
+    """Comparison of the engines for a plan in one mode; and the jump in the default engine, None
+    if that lost the robot.
     """
     scene = Scene.of_plan(plan.summary, plan.robot)
     results = {}
