@@ -65,7 +65,8 @@ def physics(monkeypatch):
 def test_engines_that_measure_the_same_certify_a_plan(folder, physics, capsys):
     assert cli.main(["certify", str(folder), "--n", "3", "--jobs", "1"]) == 0
     said = capsys.readouterr().out
-    assert "certified: all 51 checks of the audit passed, and the engines agree that it lands" in said
+    agreed = "certified: all 51 checks of the audit passed, and the engines agree that it lands (position and pd mode)"
+    assert agreed in said and "pd mode: the engines agree\n" in said
     assert held(folder) == LAID | WRITTEN
     found = store.read_json(folder / "certificate.json")
     assert found["passed"] and found["failures"] == [] and found["audit"]["passed"]
@@ -151,6 +152,28 @@ def test_a_plan_that_fails_its_audit_is_not_certified(folder, physics, monkeypat
     found = certify(folder, 1, jobs=1, page=lambda c: certificate_page(c).html)
     assert found.failures == ["the plan fails the audit's check torque"]
     assert "Not certified." in (folder / "certificate.html").read_text()
+
+
+def test_it_is_a_certificate_of_the_modes_that_are_named(folder, physics, capsys):
+    """A plan that only some servos land alike is certified for these, and not for the others."""
+    physics.say = lambda engine, mode, drawn: {"touchdown_s": 1.506} if (engine, mode) == ("mujoco", "pd") else {}
+    asked = "certify", str(folder), "--n", "1", "--jobs", "1", "--modes"
+    assert cli.main([*asked, "whole-body"]) == 0
+    assert "the engines agree that it lands (whole-body mode)" in capsys.readouterr().out
+    assert {mode for _, mode, _ in physics.calls} == {"whole-body"}
+    assert set(store.read_json(folder / "certificate.json")["modes"]) == {"whole-body"}
+    assert cli.main([*asked, "whole-body", "pd"]) == 3
+    said = capsys.readouterr()
+    assert "whole-body mode: the engines agree\n" in said.out and "pd mode: the engines do not agree\n" in said.out
+    found = store.read_json(folder / "certificate.json")
+    assert {name: mode["agree"] for name, mode in found["modes"].items()} == {"whole-body": True, "pd": False}
+    page = (folder / "certificate.html").read_text()
+    assert page.count("The engines agree.") == page.count("The engines do not agree.") == 1
+    for modes in ((), ("pd", "pd")):
+        with pytest.raises(InputError, match=r"^modes = .*: give one or more, each of them once$"):
+            certify(folder, 1, modes=modes)
+    with pytest.raises(InputError, match=r"^mode 'servo': must be one of position, pd, whole-body"):
+        certify(folder, 1, modes=("servo",))
 
 
 def test_interrupted_it_goes_on(folder, physics, capsys):

@@ -34,13 +34,14 @@ class Played(SimpleNamespace):
         arrays |= dict(tau=np.ones((n, tape.tau.shape[1])), phase=np.array(["landing"] * n))
         arrays |= dict(foot_wrench=np.full((n, 2, 6), 150.0), joint_names=tape.joint_names)
         np.savez(folder / "simulation.npz", schema=np.array("jumplab-simulation-1"), **arrays)
-        (folder / "simulation.json").write_text(json.dumps({"engine": self.engine}))
+        (folder / "simulation.json").write_text(json.dumps({"engine": self.engine, "mode": self.mode}))
 
 
 @pytest.fixture
 def world(monkeypatch):
     """One plan for all targets, and what each engine measures; calls are listed."""
-    world, plan = SimpleNamespace(say=lambda engine: {}, calls=[], refuse=set()), jump(0.6, 0.3, method="direct")
+    world = SimpleNamespace(say=lambda engine, mode: {}, calls=[], modes=[], refuse=set())
+    plan = jump(0.6, 0.3, method="direct")
 
     def planned(self, task):
         world.calls.append(task.distance_m)
@@ -49,8 +50,11 @@ def world(monkeypatch):
         return plan
 
     def simulate(tape, robot, *, engine, mode, scene):
-        m = measured(**world.say(engine))
-        return Played(landed=m.landed, reason=m.reason, metrics=m, checks_passed=True, tape=tape, engine=engine)
+        world.modes.append(mode)
+        m = measured(**world.say(engine, mode))
+        played = Played(landed=m.landed, reason=m.reason, metrics=m, checks_passed=True, tape=tape)
+        played.engine, played.mode = engine, mode
+        return played
 
     monkeypatch.setattr(Planner, "plan", planned)
     monkeypatch.setattr(clips, "simulate_jump", simulate)
@@ -132,7 +136,7 @@ def test_what_passes_is_exported_and_the_rest_is_left_out_with_its_reason(world,
     assert row["target"]["distance_m"] == clips.targets()["forward-1"].of(Robot.load()).distance_m
     assert row["measured"][DEFAULT_ENGINE]["foot_distance_m"] == 0.6 and set(row["measured"]) == set(ENGINES)
     assert out["reasons"] == ["the knee is too slow"] and not out["passed"] and "file" not in out
-    assert (row["planned"], out["planned"]) == (True, False)
+    assert (row["planned"], out["planned"], row["mode"]) == (True, False, "position")
     assert (row["split"], out["split"]) == ("training", "held-out") and index["targets"] == 2
     assert row["picture"] == "forward-1/strip.png"
     assert (tmp_path / "lib" / row["picture"]).read_bytes().startswith(b"\x89PNG")
@@ -179,11 +183,37 @@ def test_variants_are_made_of_their_own_robots(world, tmp_path, capsys):
 
 
 def test_engines_that_do_not_agree_leave_a_clip_out(world, tmp_path, capsys):
-    world.say = lambda engine: {"com_rise_m": 0.32} if engine == "mujoco" else {}
+    world.say = lambda engine, mode: {"com_rise_m": 0.32} if engine == "mujoco" else {}
     code, _, err = run(capsys, "clips", "--out", tmp_path, "--jobs", "1", "--only", "forward-1")
-    apart = "position mode: the engines differ by 0.02 m in rise of the CoM (limit 0.01 m)"
-    assert code == 3 and err == f"jumplab: no clip of bhr passed: {apart}\n"
+    apart = "{} mode: the engines differ by 0.02 m in rise of the CoM (limit 0.01 m)"
+    assert code == 3 and err == f"jumplab: no clip of bhr passed: {apart.format('position')}\n"
     assert not (tmp_path / "forward-1" / "simulated_mjlab.npz").exists()
+    (row,) = json.loads((tmp_path / "index.json").read_text())["left_out"]
+    assert row["reasons"] == [apart.format("position"), apart.format("whole-body")] and row["mode"] == "position"
+    assert store.read_json(tmp_path / "forward-1" / "simulation.json")["mode"] == "position"
+
+
+def test_a_clip_is_the_jump_in_the_first_mode_in_which_the_engines_agree(world, tmp_path):
+    """Drives that hold angles may land differently where those that measure the base do not; row and page say which."""
+    world.say = lambda engine, mode: {"touchdown_s": 1.507} if (engine, mode) == ("mujoco", "position") else {}
+    found = clips.make_clips(Robot.load(), tmp_path, only=["forward-1"], jobs=1)
+    (row,) = found["clips"]
+    assert (row["mode"], row["passed"], row["reasons"]) == ("whole-body", True, [])
+    assert world.modes == ["position", "position", "whole-body", "whole-body"]
+    report = store.read_json(tmp_path / "forward-1" / "simulation.json")
+    assert (report["mode"], report["engine"]) == ("whole-body", DEFAULT_ENGINE)
+    index = json.loads((tmp_path / "index.json").read_text())
+    assert "whole-body mode, training" in library.clips_page(index).html
+
+
+def test_a_plan_that_fails_its_audit_is_played_in_one_mode(world, tmp_path, monkeypatch):
+    """No mode would make it pass."""
+    bad = SimpleNamespace(failed=[SimpleNamespace(name="torque")], checks=[1])
+    monkeypatch.setattr(clips.store, "write_plan", lambda *args, **options: bad)
+    monkeypatch.setattr(clips.store, "read_plan", lambda folder: (None, None, {}))
+    monkeypatch.setattr(clips.store, "write_simulation", lambda *args: None)
+    (row,) = clips.make_clips(Robot.load(), tmp_path, only=["forward-1"], jobs=1)["left_out"]
+    assert row["reasons"] == ["the plan fails the audit's check torque"] and len(world.modes) == 2
 
 
 def test_a_stopped_library_goes_on(world, tmp_path):

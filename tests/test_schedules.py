@@ -131,6 +131,7 @@ def test_the_tape_says_how_each_foot_stands():
     tape = hop().tape
     (flight,) = tape.flights
     assert tape.caught == flight.stop and not tape.contacts[flight].any()
+    assert tape.lands == (0, 1)
     cut = tape.until(tape.caught)
     assert len(cut.t) == len(cut.contacts) == flight.stop and cut.caught == len(cut.t)
     assert cut.t[-1] == tape.t[flight.stop]  # the instant of the landing is there twice

@@ -372,6 +372,41 @@ def test_an_exploded_engine_is_an_error(bhr, tape):
         record(bhr, [row], ("trunk", *bhr.foot.frames), tape.q[-1])
 
 
+def stepped(robot, q, right_up):
+    """Rows of a robot that stands, is carried 0.2 m ahead in the air, and lands on its left foot alone."""
+    weight = robot.total_mass * robot.gravity
+    down, pushed, left = (np.zeros((2, 6)) for _ in range(3))
+    pushed[:, 2], left[0, 2] = weight / 2, weight
+    rest = np.zeros(robot.model.nv), np.zeros(robot.model.nv - 6)
+    landed = q.copy()
+    landed[0] += 0.2
+    knee = [list(robot.model.names).index(robot.joints[role][1]) for role in ("hip_pitch", "knee")]
+    for joint, bend in zip(knee, (-right_up, 2 * right_up), strict=True):
+        landed[robot.model.idx_qs[joint]] += bend
+    air = np.repeat(landed[None], 60, axis=0)
+    air[:, 0] = q[0] + np.linspace(0.0, 0.2, 60)
+    poses = [(q, pushed)] * 20 + [(x, down) for x in air] + [(landed, left)] * 20
+    touching = {True: frozenset(robot.foot.frames), False: frozenset()}
+    return [(x, *rest, Contacts(wrench, touching[bool(wrench.any())], False)) for x, wrench in poses]
+
+
+def test_toes_at_touchdown_are_those_of_the_feet_that_are_to_land(bhr, tape):
+    """On one foot its own way; none where it is not that foot, or not both, that came down."""
+    q = tape.q[0]
+    names = ("trunk", *bhr.foot.frames)
+
+    def measured(right_up, lands):
+        rows = stepped(bhr, q, right_up)
+        return record(bhr, rows, names, rows[-1][0], lands=lands).metrics
+
+    one = measured(0.6, (0,))
+    assert one.touchdown_s == pytest.approx(0.08) and one.foot_distance_touchdown_m == pytest.approx(0.2)
+    assert abs(one.foot_distance_m - 0.2) > 0.01  # the mean of both, of which one is behind
+    assert measured(0.6, (1,)).foot_distance_touchdown_m is None
+    assert measured(0.6, (0, 1)).foot_distance_touchdown_m is None
+    assert measured(0.0, (0, 1)).foot_distance_touchdown_m == pytest.approx(0.2)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -74,7 +74,7 @@ def margins(args: Namespace) -> None:
 
 
 def certify(args: Namespace) -> None:
-    """Certify a plan: audit, then both physics engines in two modes, with both contacts."""
+    """Certify a plan: audit, then both physics engines in some modes, with both contacts."""
 
     def page(certificate: Any) -> str:
         return jl.plots.certificate_page(certificate).html
@@ -83,7 +83,7 @@ def certify(args: Namespace) -> None:
     certificate = resumed(studies.certify.certify, args, **options)
     args.found |= certificate.to_json()
     for mode in certificate.modes:
-        print(f"{mode.mode} mode")
+        print(f"{mode.mode} mode: the engines {'agree' if mode.agree else 'do not agree'}")
         print(jl.plots.table(mode.differences, studies.certify.COLUMNS, digits=3))
         landed = ", ".join(f"{count} in {name}" for name, count in mode.landed.items())
         print(
@@ -103,7 +103,8 @@ def certify(args: Namespace) -> None:
         )
     checks = len(certificate.audit.checks)
     print(
-        f"certified: all {checks} checks of the audit passed, and the engines agree that it lands"
+        f"certified: all {checks} checks of the audit passed, and the engines agree that it lands "
+        f"({certificate.scope})"
     )
 
 

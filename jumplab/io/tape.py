@@ -89,6 +89,17 @@ class Tape(Shown):
         came = np.flatnonzero((np.diff(down.astype(int), axis=0) > 0).any(axis=1)) + 1
         return int(came[-1]) if len(came) and down[-1].any() else len(self.t)
 
+    @cached_property
+    def lands(self) -> tuple[int, ...]:
+        """Numbers of the feet that come down as the last flight ends; all if the tape ends in the
+        air, none if it has no flight.
+        """
+        if not self.flights:
+            return ()
+        end = self.flights[-1].stop
+        down = np.ones(self.contacts.shape[1]) if end == len(self.t) else self.contacts[end]
+        return tuple(np.flatnonzero(down).tolist())
+
     def until(self, row: int) -> Tape:
         """The tape up to a ``row`` (of N), which it does not have any more."""
         rows = self.arrays().items()

@@ -4,7 +4,7 @@ nothing is reset.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
@@ -25,7 +25,7 @@ from jumplab.sim.checks import check
 from jumplab.sim.engine import engine_class
 from jumplab.sim.motors import Motors
 from jumplab.sim.perturbation import Perturbation
-from jumplab.sim.result import Row, SimulationResult, record
+from jumplab.sim.result import BOTH, Row, SimulationResult, record
 from jumplab.sim.scene import Scene
 from jumplab.sim.sensors import Perception
 
@@ -117,12 +117,13 @@ class Run:
         solves: tuple[int, int],
         rows: slice = slice(None),
         flights: int = 1,
+        lands: Sequence[int] = BOTH,
         **settings: Any,
     ) -> SimulationResult:
         """The checked record of the run, or of some ``rows`` of it.
 
         ``goal`` (nq,) is where the robot shall land, ``solves`` are the QPs posed and failed, and
-        it is to fly so many ``flights``.
+        it is to fly so many ``flights`` and to end the last one on the feet ``lands``.
         """
         settings |= dict(
             scene=self.scene.name,
@@ -149,6 +150,7 @@ class Run:
             goal,
             higher_m=higher_m,
             flights=flights,
+            lands=lands,
             solves=solves,
             settings=settings,
         )
@@ -223,6 +225,7 @@ def simulate_jump(
         controller.goal,
         controller.solves,
         flights=len(tape.flights) if disturbance is None else 1,
+        lands=tape.lands,
         reaim=control.get("reaim", False),
         step=control.get("step", False),
         mode=controller.mode,

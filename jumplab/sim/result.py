@@ -37,6 +37,7 @@ MIN_FLIGHT_S = 0.05
 LOADED = 0.05  # [1] of the weight
 FLOWN_M = 0.01  # way of the toe until the middle of a flight; feet that only carry nothing stay
 REPORT_NAME = "simulation.json"
+BOTH = 0, 1  # feet
 XZ = tuple[float, float]
 ByJoint = dict[str, float]
 Maybe = float | None  # where the jump did not get so far
@@ -80,7 +81,7 @@ class Metrics(Shown):
 
     # travel of the toes from the start to where they stand at the end
     foot_distance_m: Maybe = None
-    # the same, to the touchdown, if that is on both feet
+    # the same of the feet that are to land, to the touchdown; None unless it is on them
     foot_distance_touchdown_m: Maybe = None
     side_m: Maybe = None  # travel of the soles to the left, from the start to the end
     yaw_rad: Maybe = None  # turn of the feet about the vertical, whole turns counted
@@ -277,6 +278,7 @@ def record(
     *,
     higher_m: float = 0.0,
     flights: int = 1,
+    lands: Sequence[int] = BOTH,
     solves: tuple[int, int] = (0, 0),
     settings: dict | None = None,
 ) -> SimulationResult:
@@ -284,8 +286,9 @@ def record(
 
     ``rows`` are of each step (nq,) and (nv,) before it, the motors' torques (nv - 6,) in it [N m],
     and what touched in it; ``goal`` (nq,) is how the tape ends, where the ground is really
-    ``higher_m`` higher [m], after so many ``flights``; ``solves`` are QPs posed and failed. Raises
-    :class:`SolverError` if the engine's numbers have exploded.
+    ``higher_m`` higher [m], after so many ``flights``, of which the last one ends on the feet
+    ``lands`` (0 left, 1 right); ``solves`` are QPs posed and failed. Raises :class:`SolverError`
+    if the engine's numbers have exploded.
     """
     *columns, contacts = zip(*rows, strict=True)
     q, v, tau = map(np.array, columns)
@@ -318,7 +321,7 @@ def record(
         array.setflags(write=False)
     names = dict(link_names=links, joint_names=robot.joint_names)
     run = SimulationResult(**log, **names, metrics=None, settings=settings or {}, robot=robot)
-    jump = _Jump(run, gauge, goal, flown, flights)
+    jump = _Jump(run, gauge, goal, flown, flights, list(lands))
     verdict = zip(("standing_s", "landed", "reason"), jump.verdict(higher_m), strict=True)
     metrics = Metrics(
         **jump.loads(),
@@ -343,6 +346,7 @@ class _Jump:
     goal: np.ndarray
     flown: list[tuple[int, int | None]]
     flights: int
+    lands: list[int]
 
     @cached_property
     def liftoff(self) -> int | None:
@@ -402,11 +406,15 @@ class _Jump:
             return {}
         gauge = self.gauge
         heading = gauge.heading(self.goal)
+        foot = run.robot.foot
         # a turn moves the toes, and shall be no distance
-        place = gauge.soles if heading else gauge.toe
-        start, touch, end = (place(run.q[row]) for row in (0, down, -1))
-        heights = [foot.act(self.run.robot.foot.center)[2] for foot in gauge.places(run.q[down])]
-        both = abs(np.subtract(*heights)) < LEVEL_TOLERANCE_M
+        point = foot.center if heading else foot.tip
+        start, touch, end = (
+            np.array([x.act(point) for x in gauge.places(run.q[row])]) for row in (0, down, -1)
+        )
+        way = (end - start).mean(axis=0)
+        heights = np.array([x.act(foot.center)[2] for x in gauge.places(run.q[down])])
+        on_them = heights[self.lands].max() - heights.min() < LEVEL_TOLERANCE_M
         seen = about_vertical(-heading)
         impact = run.foot_wrench[down:, :, :3].sum(axis=1)[: round(IMPACT_S / STEP_S)]
         window = round(SMOOTHING_S / STEP_S)
@@ -417,9 +425,11 @@ class _Jump:
         trunk = np.unwrap(np.arctan2(2 * (w * z - x * y), 1 - 2 * (x * x + z * z)))
         return dict(
             touchdown_s=float(run.t[down]),
-            foot_distance_m=float(end[0] - start[0]),
-            foot_distance_touchdown_m=float(touch[0] - start[0]) if both else None,
-            side_m=float(end[1] - start[1]),
+            foot_distance_m=float(way[0]),
+            foot_distance_touchdown_m=(
+                float((touch - start)[self.lands, 0].mean()) if on_them else None
+            ),
+            side_m=float(way[1]),
             yaw_rad=float(np.unwrap([trunk[-1] - trunk[0], yaw])[1]),
             touchdown_trunk_pitch_rad=float(np.unwrap(pitch_of(run.q[: down + 1]))[-1]),
             touchdown_trunk_rate=float(run.v[down, 4]),

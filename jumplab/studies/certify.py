@@ -1,14 +1,19 @@
-"""Do two physics agree on a plan? Its audit, then every engine in two modes: the robot as planned,
+"""Do two physics agree on a plan? Its audit, then every engine in some modes: the robot as planned,
 and perturbed ones; and the robot as planned on contacts as each engine has them by default.
 
 Engines differ in how feet meet the ground. Their differences show which part of a jump depends on
 that, and not on its plan.
+
+They also depend on the servos: drives that hold angles let a robot on one foot tip a little
+differently on each ground, where servos that measure the base do not. A certificate is therefore
+one of a plan in the modes that it names, and of all of these: a user asks for those in which the
+plan will be played. The limits are the same in every mode.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -19,6 +24,8 @@ import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.auditing import AuditReport, audit
+from jumplab.control.servo import servo_of
+from jumplab.errors import InputError, quoted
 from jumplab.io import folder as store
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, Perturbation, SensorNoise
@@ -27,7 +34,7 @@ from jumplab.studies.study import Plain, Task, check_numbers, short_hash
 from jumplab.studies.trials import PlanOnFile, Trial, TrialKey, TrialSettings, run_trial
 from jumplab.task import JumpTask
 
-MODES = "position", "pd"  # which need no more than joints measure
+MODES = "position", "pd"  # usual ones, which need no more than joints measure
 SCHEMA = "jumplab-certificate-1"
 (NAME, PAGE) = store.CERTIFICATE
 # of perturbed robots, in whichever mode and engine
@@ -138,6 +145,11 @@ class ModeReport:
         return {name: sum(pair[name].landed for pair in self.pairs) for name in self.planned}
 
     @property
+    def agree(self) -> bool:
+        """Whether the engines agree that it lands."""
+        return not self.failures
+
+    @property
     def failures(self) -> list[str]:
         """Reasons why the engines do not agree on a landing, in sentences."""
         sentences = [
@@ -173,6 +185,7 @@ class ModeReport:
             row = {"number": k, "same": k not in self.unlike, "apart": apart}
             robots.append(row | _verdicts(pair))
         return {
+            "agree": self.agree,
             "as_planned": _verdicts(self.planned),
             "differences": self.differences,
             "perturbed": {
@@ -219,8 +232,13 @@ class Certificate:
         return checks + [sentence for mode in self.modes for sentence in mode.failures] + falls
 
     @property
+    def scope(self) -> str:
+        """The modes that it is about, in words."""
+        return " and ".join(mode.mode for mode in self.modes) + " mode"
+
+    @property
     def passed(self) -> bool:
-        """True if audit and engines agree that the plan lands."""
+        """True if audit and engines, in every one of its modes, agree that the plan lands."""
         return not self.failures
 
     def to_json(self) -> Plain:
@@ -255,17 +273,20 @@ def certify(
     n: int = 10,
     seed: int = 0,
     *,
+    modes: Sequence[str] = MODES,
     page: Callable[[Certificate], str] | None = None,
     jobs: int | None = None,
     progress: bool | None = None,
 ) -> Certificate:
-    """Audit the plan in ``folder``, and let all engines play it in two modes: as planned, and on
+    """Audit the plan in ``folder``, and let all engines play it in some modes: as planned, and on
     ``n`` other robots (the same in all).
 
     Parameters
     ----------
     n, seed, jobs, progress : as of :func:`jumplab.studies.trials.run_trials`. Finished simulations
         are kept in ``trials.jsonl``: a stopped run resumes from there.
+    modes : of playback ("position", "pd", "whole-body") in each of which the engines have to agree;
+        the first one is also played on usual contacts.
     page : makes the text of ``certificate.html``, written with ``certificate.json``, if there is to
         be one.
 
@@ -276,15 +297,19 @@ def certify(
         installed, or a robot that one of them cannot read.
     """
     check_numbers(n, seed, jobs)
+    if not modes or len(set(modes)) < len(modes):
+        raise InputError(f"modes = {quoted(modes)}: give one or more, each of them once")
+    for mode in modes:
+        servo_of(mode)
     for engine in ENGINES:
         engine_class(engine)
     plan = PlanOnFile.read(folder)
     task = JumpTask(**plan.summary["target"])
     report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
-    modes = []
-    total = ((n + 1) * len(MODES) + 1) * len(ENGINES)
+    reports = []
+    total = ((n + 1) * len(modes) + 1) * len(ENGINES)
     with plan.study(total=total, jobs=jobs, progress=progress) as study:
-        for mode in MODES:
+        for mode in modes:
             trials = {}
             for engine in ENGINES:
                 work = _as_planned(plan, mode, engine)
@@ -292,11 +317,11 @@ def certify(
                 trials[engine] = study.results(work)
             jumps = zip(*trials.values(), strict=True)
             first, *pairs = (dict(zip(ENGINES, jump, strict=True)) for jump in jumps)
-            modes.append(ModeReport(mode, first, tuple(pairs), task.in_plane))
-        softly = partial(_as_planned, plan, MODES[0], contact="usual")
+            reports.append(ModeReport(mode, first, tuple(pairs), task.in_plane))
+        softly = partial(_as_planned, plan, modes[0], contact="usual")
         usual = {engine: study.results(softly(engine))[0] for engine in ENGINES}
     where = task, plan.robot, plan.hash, seed, study.resumed
-    certificate = Certificate(report, tuple(modes), usual, *where)
+    certificate = Certificate(report, tuple(reports), usual, *where)
     pages = {PAGE: page(certificate)} if page else {}
     plan.write(NAME, certificate.to_json(), pages)
     return certificate
