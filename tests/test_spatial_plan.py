@@ -35,7 +35,7 @@ from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Contacts, Limits, Mesh, Place, Weights, WholeBodyPlanner
 from jumplab.stages.whole_body import plan as ended
 from jumplab.stages.whole_body import planner as planning
-from jumplab.stages.whole_body.apart import MORE_M, face_gaps, merged, placed, too_close
+from jumplab.stages.whole_body.apart import MORE_M, face_gaps, merged, placed, too_close, used_apart
 from jumplab.stages.whole_body.between import (
     ACCELERATION_GAP,
     CLEAR_M,
@@ -53,7 +53,7 @@ from jumplab.stages.whole_body.ground import Surface, surface_of_jump
 from jumplab.stages.whole_body.instant import Instant
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.program import FINER, Program
-from jumplab.stages.whole_body.shapes import ROUNDED_M, Pair
+from jumplab.stages.whole_body.shapes import ROUNDED_M, Apart, Pair
 from jumplab.stages.whole_body.starts import COLD, FROM_NEIGHBOUR
 from jumplab.stages.whole_body.tape import AIR, FLAT, TOE, pressed
 from jumplab.task import JumpTask
@@ -650,6 +650,22 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
     beside = [replace(x, first=x.last + 1, last=x.last + 6) for x in found]
     assert merged(found, beside) == tuple(replace(x, last=x.last + 6) for x in found)
     assert merged(apart, ()) == apart
+
+
+def test_a_tape_that_leaves_its_nodes_may_not_meet_what_they_keep_apart(bhr):
+    """Feet that cross on the tape alone, inside and outside of the nodes of their row."""
+    plan, body = jump(SIDE), Body(bhr)
+    phases, tape = list(plan.whole_body.phases.values()), plan.tape
+    left, right = (next(x for x in body.shapes if x.name == f"{side}_foot_0") for side in ("left", "right"))
+    rows = [Apart(2, 4, 8, Pair(left, right, 0))]
+    assert used_apart(body, rows, phases, tape) < 0 and used_apart(body, [], phases, tape) < 0
+    began = sum(p.duration for p in phases[:2])
+    step = phases[2].duration / (len(phases[2].t) - 1)
+    rolls = [7 + bhr.joint_names.index(f"{side}_hip_roll") for side in ("left", "right")]
+    for node, meet in ((6, True), (2, False), (10, False)):
+        q = tape.q.copy()
+        q[np.ix_(np.abs(tape.t - began - node * step) < 0.5 * step, rolls)] += [-0.5, 0.5]
+        assert (used_apart(body, rows, phases, replace(tape, q=q)) > 1) == meet
 
 
 @pytest.mark.parametrize(("pitch", "roll", "links", "axis"), [(-2.5, 0.0, "trunk_0 thigh", 0), (-1.7, 0.4, "foot", 1)])

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
+from jumplab.io.tape import Tape
 from jumplab.ocp.solution import PhaseSolution
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.shapes import Apart, Box, Pair
@@ -16,6 +17,8 @@ SAMPLES = 3  # in every interval, that are looked at
 NODES = 2  # before and after such an instant that a row is for
 MORE_M = 0.006  # that links which met between the nodes of their row keep besides
 MET_M = 1e-3  # nearer than what a row asks for by this, links are said to meet
+TOUCH_M = 1e-3  # nearer than this they touch, for the audit
+EVERY = 4  # of so many samples of a tape one is looked at
 
 Placed = tuple[Box, np.ndarray, np.ndarray]  # middles (n, 3) and axes (n, 3, 3) of a box
 
@@ -70,6 +73,28 @@ def _face(gaps: np.ndarray, rows: np.ndarray, least_m: float) -> int:
     may = clear[:, around].all(axis=1)
     least = gaps[:, rows].min(axis=1)
     return int(np.argmax(np.where(may, least, -np.inf) if may.any() else least))
+
+
+def used_apart(
+    body: Body, rows: Sequence[Apart], phases: Sequence[PhaseSolution], tape: Tape
+) -> float:
+    """Largest share [1] of what links with ``rows`` may be near, that the ``tape`` of the
+    ``phases`` uses; 1 where they nearly touch.
+
+    Its joints may leave those of the phases, between the nodes of a flight.
+    """
+    ends = np.cumsum([0.0, *(p.duration for p in phases)])
+    names = [box.name for box in body.shapes]
+    numbers = {frozenset((names[i], names[k])): n for n, (i, k) in enumerate(body.candidates)}
+    least = np.inf
+    for x in rows:
+        number = numbers[frozenset((x.pair.first.name, x.pair.second.name))]
+        step = phases[x.phase].duration / (len(phases[x.phase].t) - 1)
+        during = ends[x.phase] + step * np.array([x.first, x.last])
+        first, last = np.searchsorted(tape.t, during)
+        for q in tape.q[first:last:EVERY]:
+            least = min(least, _distance(body, number, q))
+    return 2 - least / TOUCH_M
 
 
 def placed(body: Body, configurations: np.ndarray) -> list[Placed]:

@@ -10,6 +10,7 @@ import numpy as np
 from jumplab.errors import Shown
 from jumplab.io.tape import Tape
 from jumplab.ocp.solution import PhaseSolution, Solution
+from jumplab.stages.whole_body.apart import used_apart
 from jumplab.stages.whole_body.between import used_between
 from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.program import Program, Solved
@@ -62,7 +63,10 @@ class WholeBodyPlan(Shown):
             surface.edge_m - robot.foot.toe + float(robot.foot.center[0]),
             program.limits,
             tape,
-            used_between(tape, robot, surface),
+            max(
+                used_between(tape, robot, surface),
+                used_apart(program.body, solved.schedule.apart, list(phases.values()), tape),
+            ),
             start,
         )
 
