@@ -8,6 +8,7 @@ import pytest
 
 import jumplab as jl
 from jumplab.auditing.audit import audit
+from jumplab.errors import RobotError
 from jumplab.io.motion import Motion
 from jumplab.io.whole import Whole
 from jumplab.models.spatial import SpatialModel, SpatialState
@@ -91,6 +92,24 @@ def test_a_changed_trunk_is_a_changed_load(tmp_path):
     robot = loaded(tmp_path, robots.torso)
     heavier = robot.with_mass("pelvis", factor=1.5)
     assert heavier.locked[0].part.mass == pytest.approx(1.5 * robot.locked[0].part.mass)
+
+
+def test_a_weaker_robot_has_a_weaker_waist(tmp_path):
+    """Factors on all motors count for held ones; each can be changed by its name, but only its effort."""
+    robot = loaded(tmp_path, robots.torso)
+    efforts = {
+        50.0: robot.with_limits(effort=0.5),
+        150.0: robot.with_limits(effort={"waist": 1.5}),
+        35.0: robot.with_limits(joints={"waist": {"effort": 35.0}}),
+        100.0: robot.with_limits(speed=0.9, effort={"knee": 1.1}),
+    }
+    for effort, other in efforts.items():
+        assert other.locked[0].effort == effort and other.hash != robot.hash
+    assert robot.with_limits(effort=1.0) is robot
+    assert efforts[150.0].actuators == robot.actuators
+    assert "# changed: effort of joint 'waist', 100 -> 50 N m" in efforts[50.0].config_text
+    with pytest.raises(RobotError, match="the speed of joint 'waist' cannot change: it is held, so only its effort"):
+        robot.with_limits(joints={"waist": {"speed": 3.0}})
 
 
 def test_plans_keep_within_a_weak_waist(tmp_path):

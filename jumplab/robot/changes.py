@@ -28,8 +28,9 @@ GEARED = {"armature": 2, "friction": 1, "damping": 2}  # powers of a gear's rati
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[str]]:
-    """The URDF with other limits, and the remarks: none where nothing changes.
+def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[str], str]:
+    """The URDF with other limits, the remarks (none where nothing changes), and the TOML with other
+    efforts of joints that are held.
 
     Parameters
     ----------
@@ -38,17 +39,20 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
 
     Raises :class:`RobotError` as :meth:`.Robot.with_limits` says.
     """
-    new: dict[str, dict[str, float]] = {name: {} for name in robot.joint_names}
+    held = {joint.name: {"effort": joint.effort} for joint in robot.locked}
+    old = {name: robot.actuators[name] for name in robot.joint_names} | held
+    new: dict[str, dict[str, float]] = {name: {} for name in old}
     for what, given in factors.items():
         if not isinstance(given, Mapping):
             factor = _number(robot, f"the factor on {what}", given)
-            given = dict.fromkeys(robot.joint_names, factor)
-        for key, names in _joints(robot, given, f"the factors on {what}"):
+            given = dict.fromkeys((name for name in old if what in old[name]), factor)
+        for key, names in _joints(robot, given, f"the factors on {what}", held):
+            _check_held(robot, key, what, held)
             factor = _number(robot, f"the factor on {what} of {key!r}", given[key])
             for name in names:
-                new[name][what] = robot.actuators[name][what] * factor
+                new[name][what] = old[name][what] * factor
     signs = {name: sign for name, _, sign in robot.role_signs()}
-    for key, names in _joints(robot, ranges, "the ranges"):
+    for key, names in _joints(robot, ranges, "the ranges", held):
         asked = ranges[key]
         if not (isinstance(asked, Mapping) and asked and set(asked) <= set(UNITS)):
             raise robot.error(
@@ -56,6 +60,7 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
                 f"speed [rad/s], got {quoted(asked)}"
             )
         for end, value in asked.items():
+            _check_held(robot, key, end, held)
             what = f"{end} of {key!r} [{UNITS[end]}]"
             value = _number(robot, what, value, positive=end not in ENDS)
             for name in names:
@@ -63,16 +68,38 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
                 turned = end in ENDS and key not in robot.joint_names and signs[name] < 0
                 new[name][ENDS[end] if turned else end] = -value if turned else value
     root = _parsed(robot)
+    remarks = _limited(root, {name: new[name] for name in robot.joint_names}, old)
+    config_text = robot.config_text
+    if held:
+        config = tomlkit.parse(config_text)
+        published = ET.fromstring(config["published"]["urdf"])
+        if moved := _limited(published, {name: new[name] for name in held}, old):
+            remarks += moved
+            text = tomlkit.string(_text(published), multiline=True, literal=True)
+            config["published"]["urdf"] = text
+            config_text = tomlkit.dumps(config)
+    return _text(root), remarks, config_text
+
+
+def _limited(root: ET.Element, new: Mapping, old: Mapping) -> list[str]:
+    """Set ``new`` limits of joints in a URDF that differ from ``old`` ones; a remark on each."""
     remarks = []
     for joint in root.findall("joint"):
         name = joint.get("name")
         for what, value in new.get(name, {}).items():
-            old = robot.actuators[name][what]
+            before = old[name][what]
             text = f"{value:.12g}"
-            if float(text) != old:
+            if float(text) != before:
                 joint.find("limit").set("velocity" if what == "speed" else what, text)
-                remarks.append(f"{what} of joint {name!r}, {old:.12g} -> {text} {UNITS[what]}")
-    return _text(root), remarks
+                remarks.append(f"{what} of joint {name!r}, {before:.12g} -> {text} {UNITS[what]}")
+    return remarks
+
+
+def _check_held(robot: Robot, key: str, what: str, held: Mapping) -> None:
+    if key in held and what != "effort":
+        raise robot.error(
+            f"the {what} of joint {key!r} cannot change: it is held, so only its effort counts"
+        )
 
 
 def masses(
@@ -189,14 +216,16 @@ def _bodies(root: ET.Element) -> dict[str, list[ET.Element]]:
     return bodies
 
 
-def _joints(robot: Robot, given: Mapping, where: str) -> list[tuple[str, Sequence[str]]]:
+def _joints(
+    robot: Robot, given: Mapping, where: str, held: Sequence[str] = ()
+) -> list[tuple[str, Sequence[str]]]:
     """(name as given, its joints); roles come first, so that a joint's own number counts."""
     if not isinstance(given, Mapping):
         raise robot.error(f"{where} must be a mapping from joints or roles, got {quoted(given)}")
     roles = dict(zip((*SAGITTAL_JOINTS, *ROLES), ROLES * 2, strict=True))
     pairs = []
     for key in given:
-        if key in robot.joint_names:
+        if key in robot.joint_names or key in held:
             pairs.append((key, (key,)))
         elif key not in roles:
             raise robot.error(

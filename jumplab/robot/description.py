@@ -270,9 +270,10 @@ class Robot(Shown):
         Armature, friction and damping of the motors stay as they are.
 
         Roles are those of :attr:`joints`, or hip, knee, ankle, shoulder; where a joint and its role
-        are both named, the joint's own counts. The URDF gets the new numbers, the TOML a remark on
-        each, so the :attr:`hash` is new. Raises :class:`RobotError` for names that the robot lacks,
-        for numbers that are no limits, and if the robot cannot stand within them.
+        are both named, the joint's own counts; joints that are held (:attr:`locked`) have only an
+        effort. The URDF gets the new numbers, the TOML a remark on each, so the :attr:`hash` is
+        new. Raises :class:`RobotError` for names that the robot lacks, for numbers that are no
+        limits, and if the robot cannot stand within them.
 
         Parameters
         ----------
@@ -323,12 +324,13 @@ class Robot(Shown):
         """
         return self._changed(*changes.legs(self, factor, thigh, shank))
 
-    def _changed(self, urdf: str, remarks: list[str]) -> Robot:
-        """The robot of another URDF, with remarks in its TOML; itself without any."""
+    def _changed(self, urdf: str, remarks: list[str], config_text: str = "") -> Robot:
+        """The robot of another URDF, with remarks in its TOML (or another one); itself without."""
         if not remarks:
             return self
         lines = "".join(f"# changed: {remark}\n" for remark in remarks)
-        robot = replace(self, urdf=urdf, config_text=f"{self.config_text.rstrip()}\n{lines}")
+        text = (config_text or self.config_text).rstrip()
+        robot = replace(self, urdf=urdf, config_text=f"{text}\n{lines}")
         foreign.importer().check_texts(robot.urdf, robot.config_text)
         check_stance(robot)
         return robot
