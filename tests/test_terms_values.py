@@ -20,7 +20,7 @@ from jumplab.stages import srmp
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.whole_body import Contacts, Limits, Weights, coordinates
 from jumplab.stages.whole_body.body import Body
-from jumplab.stages.whole_body.contacts import jump_contacts
+from jumplab.stages.whole_body.contacts import SIDES, jump_contacts
 from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.settings import LATE_SHARE, RESERVE_SHARE, Mesh
 
@@ -449,13 +449,13 @@ def test_terms_of_the_whole_body_on_the_ground(programs, body, place, seed):
         expected["load of each foot"] = [sum(f[2] for f in x.pushed[side]) for side in x.sides]
     if place[1] == "flat":
         expected |= x.pressed(0.35)
-    if len(x.modes) == 1:
-        mg = body.mg
-        pushes = list(zip(x.local[0], x.pushed[0], strict=True))
+    mg = body.mg
+    for side in () if place[0] == "whole body" else x.sides:
+        pushes = list(zip(x.local[side], x.pushed[side], strict=True))
         total = sum(f for _, f in pushes) / mg
         about = sum(np.cross(at, f) for at, f in pushes) / mg
         arm = LIM.friction * LIM.torsion_arm_m * total[2] ** 2
-        expected["spin of left foot"] = arm - BOTH * (total @ about)
+        expected[f"spin of {SIDES[side]} foot"] = arm - BOTH * (total @ about)
     check(of(problem, phase.name, "node"), expected, p)
     jerks = x.full(x.jerks)
     attitude = [5] if x.plane else [3, 4, 5]

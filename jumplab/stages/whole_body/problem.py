@@ -170,7 +170,7 @@ class Schedule:
         steps = any(len(p.modes) == 1 for p in phases[max(k - 1, 0) : k + 2])
         if m.feet == "LR" and not steps and (m.limits.least_push or not m.free.even):
             terms.append(loads(m))
-        if len(m.modes) == 1 or self.follows:
+        if not self.free.even:
             terms += [torsion(m, side) for side in m.sides]
         if m.flying:
             terms += flight_rows(m)

@@ -76,7 +76,7 @@ class Limits:
     opening_speed_share: float = 1.0
     # where left and right move differently
     side_margin_m: float = 0.02  # CoP inside the sole's sides
-    torsion_arm_m: float = 0.045  # on which friction resists the spin of a foot that carries alone
+    torsion_arm_m: float = 0.045  # on which friction resists the spin of a foot
     foot_share: float = 0.15  # of the weight, on each flat foot at least
     knee_rad: float = 2.2  # flexion at most: deeper squats end on one leg
     roll_rad: float = 1.0  # of the base, far from the chart's end at a quarter turn

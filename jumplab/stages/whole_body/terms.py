@@ -284,8 +284,8 @@ def loads(m: Mode) -> Term:
 
 
 def torsion(m: Mode, side: int) -> Term:
-    """Friction holds a foot that carries alone against the moment about the vertical through its
-    CoP: |f . m| <= mu arm f_z^2, with force f and moment m (3,).
+    """Friction holds a foot against the moment about the vertical through its CoP:
+    |f . m| <= mu arm f_z^2, with force f and moment m (3,).
     """
     arm = m.limits.friction * m.limits.torsion_arm_m
 
