@@ -27,17 +27,18 @@ from jumplab.task import JumpTask
 from paper import logs
 
 LOG = Path(__file__).with_name("records.jsonl")
-WHAT = ("height_m", "distance_m")
+WHAT = ("height_m", "distance_m", "side_m", "platform_m", "yaw_rad")
 BOUNDED = ("distance_m", "side_m", "platform_m", "height_m")
 BINDING = 3  # limits that a row names
 COLUMNS = {
     "robot": "robot",
-    "highest": "rise in flight [m]",
+    "height_m": "rise in flight [m]",
     "standing": "apex against standing [m]",
-    "played_high": "lands at",
-    "farthest": "distance [m]",
+    "distance_m": "distance [m]",
     "bound": "no motion with its rise farther than [m]",
-    "played_far": "lands at ",
+    "side_m": "to the side [m]",
+    "platform_m": "platform [m]",
+    "yaw_rad": "turn [rad]",
     "ends": "the rise ends by",
 }
 
@@ -86,18 +87,19 @@ def missing(done: Any) -> Iterator[tuple[str, str]]:
 
 
 def records_table() -> Table:
-    """The records of each robot, a row a robot."""
+    """The records of each robot, a row a robot, each with the share of it that lands in both engines."""
     by: dict[str, dict[str, dict[str, Any]]] = {}
     for x in rows():
         by.setdefault(x["robot"], {})[x["what"]] = x
     out = []
     for name, found in by.items():
-        high, far = (found.get(what, {}) for what in WHAT)
-        line = {"robot": name, "ends": ", ".join(high.get("ends", ()))}
-        line |= {"highest": high.get("value"), "standing": high.get("apex_m"), "farthest": far.get("value")}
-        line["bound"] = far.get("bound")
-        for key, x in (("played_high", high), ("played_far", far)):
-            line[key] = f"{x['share']:.0%}" if x.get("landed") and all(x["landed"].values()) else None
+        high = found.get("height_m", {})
+        line = {"robot": name, "standing": high.get("apex_m"), "ends": ", ".join(high.get("ends", ()))}
+        line["bound"] = found.get("distance_m", {}).get("bound")
+        for what, x in found.items():
+            if x["value"] is not None:
+                lands = f"{x['share']:.0%}" if x["landed"] and all(x["landed"].values()) else "falls"
+                line[what] = f"{x['value']:.3g} ({lands})"
         out.append(line)
     return table(out, COLUMNS, digits=3)
 
