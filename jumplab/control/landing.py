@@ -59,13 +59,12 @@ class LandingGains:
     trunk_rate: float = 7.0
     foot_rate: float = 25.0
     posture_rate: float = 8.0
-    # x: once the pressure is at a sole's edge, only trunk and arms still catch the robot; z: a late
-    # push meets the end of the knee's stroke
-    com_weight: tuple[float, float, float] = (150.0, 10.0, 30.0)
+    # z: a late push meets the end of the knee's stroke
+    com_weight: tuple[float, float, float] = (30.0, 10.0, 30.0)
     momentum_weight: float = 0.5  # of L-rate over a nominal inertia, hence also rad/s^2
     trunk_weight: float = 0.5
     foot_weight: float = 20.0  # of a foot that stands, or takes a recovery step
-    foot_turning_weight: float = 4.0  # or heels rise as ankles turn back from their stops
+    foot_turning_weight: float = 0.5
     swing_weight: float = 1.0  # of one that is to come down
     swing_turning_weight: float = 0.05
     arm_posture_weight: float = 0.02
