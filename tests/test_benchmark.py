@@ -43,10 +43,10 @@ def test_rows_are_medians_over_targets_of_medians_over_repeats():
 @pytest.mark.slow
 def test_every_sort_is_timed_and_audited():
     task, said = JumpTask(0.4, 0.3), []
-    found = benchmark.bench("bhr", task, 1, sorts=tuple(SORTS)[:4], most=2, say=said.append)
+    found = benchmark.bench("bhr", task, 1, sorts=tuple(SORTS)[:4], most=1, say=said.append)
     again = json.loads(json.dumps(found))
     assert [x["sort"] for x in again["rows"]] == [*SORTS][:4] == [x.partition(":")[0] for x in said]
-    assert all(x["targets"] == x["planned"] == x["clean"] == 2 for x in again["rows"]), again["rows"]
+    assert all(x["targets"] == x["planned"] == x["clean"] == 1 for x in again["rows"]), again["rows"]
     assert again["rows"] == json.loads(json.dumps(rows(found["raw"])))
     near = {x["sort"]: x["iterations"] for x in again["rows"]}
     assert max(near["ahead, re-planned"], near["ahead, from an atlas"]) < near[BASE] / 2
