@@ -326,13 +326,14 @@ class _Search:
         robot = self.planner.robot
         program = self.program(self.task)
         failed = ""
+        reached = self.task
         for share in STEPS_BACK:
-            task = self.at(self.task, share)
             try:
                 if share == 1:
-                    body = self.stage.refined(program, Asked(task, near=best), RECORD)
+                    body = self.stage.refined(program, Asked(reached, near=best), RECORD)
+                    reached = body.task  # finer meshes may allow less
                 else:
-                    body = self.stage.plan(task, near=best)
+                    body = self.stage.plan(self.at(reached, share), near=best)
             except (InfeasibleError, SolverError) as e:
                 failed = str(e)
                 continue
