@@ -221,6 +221,7 @@ def test_feet_that_both_bounced_are_pressed_down_again(bhr, gap_m, stands):
     """Just over the ground that they met both stand; feet that hover in step with each other would never meet it."""
     control, q, v = LandingController(bhr), stance_configuration(bhr), np.zeros(bhr.model.nv)
     control.body.update(q, v)
+    assert control.standing(0.0, np.zeros(2)).all()  # no foot was loaded yet
     assert control.standing(0.0, np.full(2, 200.0)).all()
     q[2] += gap_m
     control.body.update(q, v)

@@ -118,7 +118,7 @@ class LandingController:
         self._posture_weight = np.where(arms, g.arm_posture_weight, legs_weight)
         self._corners = corner_rows(robot, PLANNED_FRICTION, *SOLE_SHARE)
         self._last_contact = np.full(2, -np.inf)
-        # [m] height of the lowest sole that was loaded last; it begins when one is
+        # [m] height of the lowest sole that was loaded last; before, both feet count as standing
         self._ground = np.inf
         # accelerations, wrenches, and what these differ by
         left, right = body.unknowns[-12:-6], body.unknowns[-6:]

@@ -42,8 +42,8 @@ def locked_joints(robot: Robot) -> tuple[LockedJoint, ...]:
     """Joints between the base and parts of more than 5 % of the robot's mass, from the table
     [published]; none where there is no such table.
 
-    Parts scale with the mass of the base, which may have been changed since; efforts stay those of
-    the published file. Raises :class:`RobotError` if the table makes no robot.
+    Parts scale with the mass of the base, which may have been changed since. Raises
+    :class:`RobotError` if the table makes no robot.
     """
     config = read_toml(robot.config_text, "robot configuration")
     if "published" not in config:

@@ -13,7 +13,6 @@ from jumplab.sim import STEP_S
 from jumplab.sim.checks import LOADED_N, friction_used, ground_of
 from jumplab.sim.result import SimulationResult, motors_spent
 
-CAUSES = ("slip", "over-rotation", "knee stop", "torque", "tip", "other")
 # [1] of the friction, used for so long: the impact of a sound landing slides less
 SLIDING = 0.97
 SLIP_S = 0.03
@@ -30,7 +29,7 @@ WEAK_S = 0.05  # a motor at the end of its torque for so long
 class Sign:
     """The earliest sign of one cause."""
 
-    cause: str  # one of :data:`CAUSES`
+    cause: str  # "slip", "over-rotation", "knee stop", "torque", "tip" or "other"
     time_s: float  # of the log
 
     def __str__(self) -> str:
