@@ -23,8 +23,6 @@ QUOTED = 300  # characters of another error that a sentence quotes
 # operations of a cost, beyond which its second derivatives, which take minutes to make, are left
 # out
 BENT = 20_000
-# operations, beyond which the search for common ones takes longer than it saves
-LARGE = 600
 
 
 def chain(q: Any, v: Any, a: Any, j: Any, h: Any) -> tuple[Any, Any, Any]:
@@ -164,11 +162,7 @@ class Formulas:
         hessian += ca.hessian(bent, x)[0]
         made["hessian"] = [weights, lam, lam_f], [ca.triu(hessian)]
         given = [x, self.data, self.parameters]
-        size = ca.n_nodes(ca.vertcat(g, *(y for _, y in self.costs)))
-        options = {"cse": size < LARGE}
-        return {
-            name: ca.Function(name, given + more, y, options) for name, (more, y) in made.items()
-        }
+        return {name: ca.Function(name, given + more, y) for name, (more, y) in made.items()}
 
 
 class Formulator:
@@ -193,10 +187,11 @@ class Formulator:
                 self._known[part.owner] = self._within(self._phases[part.owner])
             node, step, data, seen, spans = self._known[part.owner]
             local = step if part.place == "interval" else node
+        values = [_column(self.problem.place(part.owner), t, seen[t.at]) for t in part.terms]
         costs = []
         rows = []
-        for t in part.terms:
-            y = _column(self.problem.place(part.owner), t, seen[t.at])
+        # common operations are sought here: derivatives have thirty times as many, and share fewer
+        for t, y in zip(part.terms, ca.cse(values), strict=True):
             if t.is_cost:
                 costs.append((spans.get(t.at, 1.0), y))
             else:
