@@ -218,6 +218,14 @@ class Contacts:
             )
         return height, first
 
+    def eased(self, share: float) -> Contacts:
+        """The same with less to do: a ``share`` [1] of its step up or down or, on level ground, of
+        all ways and turns.
+        """
+        less = ("up_m",) if self.surface[0] else ("ahead_m", "left_m", "turn_rad")
+        places = (replace(p, **{x: share * getattr(p, x) for x in less}) for p in self.places)
+        return replace(self, places=tuple(places))
+
     def contact_of(self, phase: int, side: int) -> int:
         """Index into :attr:`landings` of the contact of a foot (0 left, 1 right) in a phase."""
         return max(i for i, (k, s) in enumerate(self.landings) if k <= phase and s == side)

@@ -38,6 +38,7 @@ from jumplab.stages.whole_body.starts import (
     MENDED,
     NEIGHBOUR,
     REFINED,
+    SCHEDULED,
     SETTLED,
     STANCE,
     Asked,
@@ -269,6 +270,8 @@ class WholeBodyPlanner:
         aside = self.contacts.ends == "touchdown" and not task.in_plane and not program.free.even
         ramp = aside and not turns and asked.straight is not None
         cold = IN_PLANE if program.free.plane else ASIDE if ramp else COLD
+        if self.contacts.ends == "rest":
+            cold = SCHEDULED
         near = FROM_NEIGHBOUR if asked.near is not None else ()
         given = GIVEN if asked.motion is not None else ()
         if task.rotation_rad:  # a body that turns over has no places for its feet

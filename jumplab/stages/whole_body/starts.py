@@ -171,6 +171,17 @@ def from_straight(program: Program, asked: Asked) -> Beginning:
     return Beginning(ramped(program.contacts, phases, asked.task))
 
 
+def from_eased(program: Program, asked: Asked) -> Beginning:
+    """The schedule with less to do (see :meth:`.Contacts.eased`), then with ever more."""
+    first, *further = EASED
+    easy = replace(program, contacts=program.contacts.eased(first))
+    solved = easy.solve_apart(asked, COLD[0])
+    for share in further:
+        easy = replace(program, contacts=program.contacts.eased(share))
+        solved = easy.solve_apart(replace(asked, near=solved), FROM_NEIGHBOUR[0])
+    return from_solved(program, solved)
+
+
 def from_solved(program: Program, solved: Solved) -> Beginning:
     """A solution in the same coordinates, at the nodes (N + 1,) of the program's phases."""
     intervals = {p.name: p.intervals for p in program.contacts.phases}
@@ -217,6 +228,13 @@ COMPARED = (
 # where the cost is within 0.1 % of its least lets it take whole steps to the end
 RAMPED = QUICK | {"mu_init": 1e-2, "mu_min": 1e-4}
 ASIDE = (Start("ramp", from_straight, True, 150, RAMPED), *COLD)
+# shares of a schedule, solved one after the other, each from the one before
+EASED = 1 / 3, 2 / 3
+SCHEDULED = (
+    COLD[0],
+    Start("schedule with less to do", from_eased, True, 100, NEAR),
+    *COLD[1:],
+)
 # in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is
 # tried soon
 IN_PLANE = (replace(COLD[0], patience=50), *COLD[1:])
