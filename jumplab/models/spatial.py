@@ -169,11 +169,11 @@ class SpatialModel:
         """
         return _clean(self.bodies[joint - 1].own.T @ np.asarray(point, float))
 
-    def attitudes(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of charts (n, >= 6), the base's attitudes (n, 3, 3), and the slopes (n, 3, 3) of its
-        angular velocity, in its own axes, along the rates of yaw, roll and pitch.
+    @staticmethod
+    def attitudes(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of yaw, roll and pitch (n, 3), the base's attitudes (n, 3, 3), and the slopes (n, 3, 3)
+        of its angular velocity, in its own axes, along their rates.
         """
-        angles = q[:, 3:6]
         return _rotation().from_euler("ZXY", angles).as_matrix(), _slopes(angles)
 
     def to_pinocchio(
@@ -186,17 +186,17 @@ class SpatialModel:
         turn = _rotation().from_euler("ZXY", angles)  # its quaternions follow whole turns
         slope, change = _slopes(angles), _slopes(angles, rates)
         speed = turn.apply(np.array(v[:, :3]), inverse=True)
-        spin = _times(slope, rates)
+        spin = np.matvec(slope, rates)
         accel = turn.apply(np.array(a[:, :3]), inverse=True) - np.cross(spin, speed)
-        turning = _times(slope, gains) + _times(change, rates)
+        turning = np.matvec(slope, gains) + np.matvec(change, rates)
         configurations = np.hstack([q[:, :3], turn.as_quat(), q[:, 6:]])
         twists = np.hstack([speed, spin, v[:, 6:]])
         return configurations, twists, np.hstack([accel, turning, a[:, 6:]])
 
     def charts(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Charts, rates and accelerations (n, 6 + joints) of a motion in Pinocchio's words: the
+    ) -> np.ndarray:
+        """Charts, rates and accelerations (3, n, 6 + joints) of a motion in Pinocchio's words: the
         inverse of :meth:`to_pinocchio`. The first attitude is within half a turn of the angles
         ``near`` (3,)."""
         chart = self.of_pinocchio(q, near)
@@ -204,11 +204,11 @@ class SpatialModel:
         speed = np.array(v[:, :3])  # SciPy turns no read-only arrays
         spin = v[:, 3:6]
         back = np.linalg.inv(_slopes(chart[:, 3:6]))
-        rates = _times(back, spin)
-        gains = _times(back, a[:, 3:6] - _times(_slopes(chart[:, 3:6], rates), rates))
+        rates = np.matvec(back, spin)
+        gains = np.matvec(back, a[:, 3:6] - np.matvec(_slopes(chart[:, 3:6], rates), rates))
         accel = turn.apply(a[:, :3] + np.cross(spin, speed))
         rates = np.hstack([turn.apply(speed), rates, v[:, 6:]])
-        return chart, rates, np.hstack([accel, gains, a[:, 6:]])
+        return np.array([chart, rates, np.hstack([accel, gains, a[:, 6:]])])
 
     def of_pinocchio(self, q: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Charts (n, 6 + joints) of configurations (n, nq), their angles continuous.
@@ -240,11 +240,6 @@ def _slopes(angles: np.ndarray, rates: np.ndarray | None = None) -> np.ndarray:
     rolling = [np.cos(pitch), 0 * pitch, np.sin(pitch)]
     pitching = [0 * pitch, 0 * pitch + 1, 0 * pitch]
     return np.array([yawing, rolling, pitching]).transpose(2, 1, 0)
-
-
-def _times(matrices: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Products (n, 3) of matrices (n, 3, 3) and columns (n, 3)."""
-    return np.einsum("nij,nj->ni", matrices, columns)
 
 
 class Turn:

@@ -11,6 +11,7 @@ import pinocchio as pin
 from jumplab.models.full import FullBody, FullTerms
 from jumplab.ocp import Phase
 from jumplab.ocp.qp import Qp
+from jumplab.ocp.solution import quintic
 from jumplab.robot import SAGITTAL_JOINTS
 from jumplab.stages.joint_qp.point import StepPoint
 from jumplab.stages.joint_qp.settings import Gain, Options
@@ -49,14 +50,12 @@ class Track:
         SRMP's pivot stays on the ground while the robot's heel may be up at take-off, so the two
         can meet only in the air.
         """
-        from scipy.interpolate import BPoly  # slow to import
-
-        start = np.asarray(value) - self.value[0], np.asarray(rate) - self.rate[0]
-        zero = np.zeros_like(start[0])
+        none = np.zeros_like(value)
+        ends = [(value - self.value[0], none), (rate - self.rate[0], none), (none, none)]
         end = min(blend_s, self.t[-1])
-        fade = BPoly.from_derivatives([0.0, end], [[*start, zero], [zero] * 3])
-        t = np.minimum(self.t, end)
-        return Track(self.t, self.value + fade(t), self.rate + fade.derivative()(t))
+        since = np.minimum(self.t, end).reshape(-1, *[1] * none.ndim)
+        offset, drift, _ = quintic(ends, end, since)
+        return Track(self.t, self.value + offset, self.rate + drift)
 
 
 def in_space(x: np.ndarray) -> np.ndarray:
