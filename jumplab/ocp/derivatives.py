@@ -297,5 +297,6 @@ def chain_term(phase: Phase) -> Term:
         which = [phase.coordinates.index(name) for name in phase.integrated]
         return ca.vertcat(rate[which], place[which])
 
-    words = "state equation, Sec. III-A, V-A", "scaled", "interval"
-    return Term(JERK_CHAIN, *words, missed, identity=True)
+    return Term(
+        JERK_CHAIN, "state equation, Sec. III-A, V-A", "scaled", "interval", missed, identity=True
+    )

@@ -110,8 +110,7 @@ class PhaseQp:
             if np.array_equal(low, high):
                 qp.equality(term.name, rows.matrix, low - rows.offset, rows.labels)
             else:
-                sides = low - rows.offset, high - rows.offset
-                qp.limit(term.name, rows.matrix, *sides, rows.labels)
+                qp.limit(term.name, rows.matrix, low - rows.offset, high - rows.offset, rows.labels)
         return qp
 
     def joint_range(

@@ -96,8 +96,9 @@ def launch_terms(o: Options) -> list[Term]:
 
     def missing(p):
         """A_f F - B_f (6 rows)."""
-        asked = p.target.com_acceleration, p.target.momentum_rate
-        return p.quantities.A_f @ p.wrench - force_target(p.body.mass, p.body.gravity, *asked)
+        return p.quantities.A_f @ p.wrench - force_target(
+            p.body.mass, p.body.gravity, p.target.com_acceleration, p.target.momentum_rate
+        )
 
     def force(p):
         return forwards(p, w.force_x, w.force) * missing(p)[:3]

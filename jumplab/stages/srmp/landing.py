@@ -200,8 +200,7 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
     def rates(sign):
         return lambda parameters: np.array([*parameters["rates"], sign * free, sign * free])
 
-    boxes = settings.lean_rad, envelope.length, base.turn_rad, base.radius_m
-    low, high = zip(*boxes, strict=True)
+    low, high = zip(settings.lean_rad, envelope.length, base.turn_rad, base.radius_m, strict=True)
     first, last = ([0.0, envelope.start[1], turn, envelope.start[3]] for turn in (-free, free))
     still = np.array([0.0, 0.0, free, 0.0])  # turning is what L at rest stops
     impact = "after the impact"

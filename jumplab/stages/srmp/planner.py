@@ -151,11 +151,12 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
         return PhaseGuess(duration, q, 0 * q, 0 * q)
 
     theta = lean + spin * flight_s * np.linspace(0.0, 1.0, n + 1)[:, None]
-    inertia = np.full_like(theta, rho), 0 * theta, 0 * theta
     return {
         "flat": leaning(0.5, 0.0, 0.8, n_flat),
         "toe": leaning(0.12, 0.8, 1.0, n_toe),
-        "flight": PhaseGuess(flight_s, *inertia, theta, constants),
+        "flight": PhaseGuess(
+            flight_s, np.full_like(theta, rho), 0 * theta, 0 * theta, theta, constants
+        ),
     }
 
 

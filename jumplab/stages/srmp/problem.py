@@ -213,8 +213,9 @@ def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
     still = "inertia rate at touchdown"
     below = "ours: foot below the CoM"
     falling = "ours: not on the way up"
-    inertia = "inertia at touchdown", "ours: rho(phi)", "kg m^2", "end"
-    usual = limit(*inertia, unusual, *s.touchdown_inertia)
+    usual = limit(
+        "inertia at touchdown", "ours: rho(phi)", "kg m^2", "end", unusual, *s.touchdown_inertia
+    )
     return [
         *([] if reach is None else [usual]),
         Term("inertia acceleration", "SF-J1", "kg m^2/s^2", "node", "a", s.w_inertia_accel),

@@ -279,8 +279,9 @@ def loads(m: Mode) -> Term:
     def forces(p):
         return ca.vertcat(*(p.feet_forces[side][2] for side in m.sides))
 
-    words = "load of each foot", "ours", "N", "node"
-    return Term(*words, forces, lower=least, upper=np.inf, scale=mg)
+    return Term(
+        "load of each foot", "ours", "N", "node", forces, lower=least, upper=np.inf, scale=mg
+    )
 
 
 def torsion(m: Mode, side: int) -> Term:
@@ -375,12 +376,11 @@ def flight_rows(m: Mode) -> list[Term]:
     link = {"identity": True, "group": "flight"}
     kept = "WF-D1, three components"
     spin = {"scale": SPIN_SCALE, "group": "flight"}
-    turns = "base turns", "state equation", "rad", "interval"
     return [
         Term("ballistic CoM", "WF-D1", "m", "node", com, **link),
         Term("ballistic CoM velocity", "WF-D1", "m/s", "node", velocity, **link),
         Term("angular momentum", kept, "kg m^2/s", "node", momentum, **spin),
-        Term(*turns, angles, identity=True),
+        Term("base turns", "state equation", "rad", "interval", angles, identity=True),
     ]
 
 
@@ -537,8 +537,7 @@ def capture_rows(m: Mode) -> list[Term]:
         return caught[[k for k in m.free.places if k < 2]]
 
     window = lim.capture_window_m
-    words = "capture window", f"ours; {CAPTURE}", "m"
-    return [end(*words, capture, -window, window, PLACE_SCALE)]
+    return [end("capture window", f"ours; {CAPTURE}", "m", capture, -window, window, PLACE_SCALE)]
 
 
 def about(m: Mode, p: Instant, place: ca.SX) -> ca.SX:
