@@ -18,6 +18,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.models.full import SIDES, FullBody, force_target
 from jumplab.ocp import Phase, Problem, Term
 from jumplab.ocp.changes import ends
+from jumplab.ocp.problem import limit
 from jumplab.robot.contact import wrench_rows
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.joint_qp.point import Affine, StepPoint
@@ -64,8 +65,7 @@ def _shared_terms(phase: str, weights: Any, limits: Limits) -> list[Term]:
         return p.target.acceleration_range
 
     def between(name, equation, unit, of, ends):
-        sides = dict(lower=lambda p: ends(p)[0], upper=lambda p: ends(p)[1])
-        return Term(name, equation, unit, "node", of, **sides)
+        return limit(name, equation, unit, "node", of, lambda p: ends(p)[0], lambda p: ends(p)[1])
 
     posture = "ours: towards the posture"
     regular = "ours: regulariser", "m/s^2, rad/s^2", "node", "accelerations"
@@ -161,8 +161,8 @@ def contact_terms(o: Options) -> list[Term]:
     return [
         Term("tiptoe", foot, "m/s^2, rad/s^2", "node", tiptoe),
         Term("foot pitch or toe moment", flat, "rad/s^2, N m", "node", pitch),
-        Term("ground", push, "N, N m", "node", ground, upper=np.inf),
-        Term("heel", above, "m/s^2", "node", heel, lower=least, upper=np.inf),
+        limit("ground", push, "N, N m", "node", ground),
+        limit("heel", above, "m/s^2", "node", heel, least),
     ]
 
 
@@ -204,7 +204,7 @@ def flight_terms(o: Options) -> list[Term]:
             w.foot_level,
         ),
         Term("inertia", shape, "kg m^2/s^2", "node", inertia, w.inertia),
-        Term("ground", above, "m/s^2", "node", ground, lower=least, upper=np.inf),
+        limit("ground", above, "m/s^2", "node", ground, least),
         *_shared_terms("flight", w, o.limits),
     ]
 

@@ -20,11 +20,11 @@ from jumplab.models.full import FullBody, FullTerms
 from jumplab.models.srmp import COORDINATES
 from jumplab.ocp import Nlp, PhaseGuess, Statistics
 from jumplab.ocp.cache import in_turn
-from jumplab.ocp.problem import Bound, Phase, Problem, Term
+from jumplab.ocp.problem import Bound, Phase, Problem, Term, limit
 from jumplab.robot import Robot
 from jumplab.robot.reach import FORCE_SHARE, Reach, reach
 from jumplab.stages.srmp.planner import SrmpStance, grid, on_ground
-from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, limit, rod_at
+from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, rod_at
 from jumplab.stages.srmp.settings import SrmpSettings
 
 # touchdown
@@ -181,7 +181,7 @@ def landing_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term
         Term("CoP from the middle", middle, "m", "node", cop, s.w_cop),
         Term("trunk upright", "ours", "rad", "node", lean, s.w_posture),
         Term("landing time", "ours", "s", "end", "duration", s.w_time),
-        limit("leg speed", joints, "m/s", "node", room, 0.0, skip=(1, 0)),
+        limit("leg speed", joints, "m/s", "node", room, skip=(1, 0)),
         Term("L at touchdown", "after the impact", unit, "start", touched, scale=10.0),
         Term("L at rest", "standing", unit, "end", "L", scale=10.0),
     ]

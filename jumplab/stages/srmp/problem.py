@@ -5,14 +5,13 @@ flight, joined at take-off (Sec. III of the paper); pure, nothing here solves.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from jumplab.models.srmp import COORDINATES, SrmpFlightState, SrmpState
 from jumplab.ocp.derivatives import chain
-from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
+from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term, limit
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.stages.srmp.settings import SrmpSettings
@@ -29,13 +28,6 @@ SCALES = {
     "j": [1000.0, 500.0, 1000.0, 500.0],
 }
 FLIGHT_SCALES = {"q": 1.0, "v": 20.0, "a": 200.0, "j": 5000.0}
-
-
-def limit(
-    name: str, equation: str, unit: str, at: str, of: Any, low: Any, high: Any = np.inf, **more: Any
-) -> Term:
-    """A constraint low <= of <= high."""
-    return Term(name, equation, unit, at, of, lower=low, upper=high, **more)
 
 
 def rod_at(mass: float, p: Point) -> SrmpState:
@@ -78,10 +70,10 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         Term("L rate", "SL-J3", "N m", "node", "L_rate", s.w_momentum_rate),
         Term("turn", "SL-J4", "rad", "node", lambda p: p.q[2], s.w_turn),
         limit("trunk range", "SL-P1, as path", "rad", "node", "posture", *reach.posture),
-        limit("inertia envelope", shape, "kg m^2", "node", inertia_room, 0.0),
+        limit("inertia envelope", shape, "kg m^2", "node", inertia_room),
         limit("L range", "SL-P5", "kg m^2/s", "node", "L", *s.momentum, scale=10.0),
-        limit("unilateral", "ours", "N", "node", push, 0.0, scale=mg, skip=(0, 1)),
-        limit("friction", "ours", "N", "node", cone, 0.0, scale=mg, skip=(0, 1)),
+        limit("unilateral", "ours", "N", "node", push, scale=mg, skip=(0, 1)),
+        limit("friction", "ours", "N", "node", cone, scale=mg, skip=(0, 1)),
         *leg_terms(mass, reach, s),
     ]
 
@@ -105,8 +97,8 @@ def leg_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     torques = "SL-B1 on F; ours: from the joint torques"
     speeds = "SL-B1; ours: from the joint speeds"
     return [
-        limit("leg force", torques, "N", "node", strength, 0.0, scale=mass * GRAVITY),
-        limit("leg speed", speeds, "m/s", "node", extension, 0.0),
+        limit("leg force", torques, "N", "node", strength, scale=mass * GRAVITY),
+        limit("leg speed", speeds, "m/s", "node", extension),
     ]
 
 
@@ -139,8 +131,8 @@ def reach_terms(reach: Reach, s: SrmpSettings, heel_up: bool) -> list[Term]:
     low = "ours: flat feet"
     flat = [
         Term("crouch depth", low, "m", "node", deep, s.w_deep_crouch),
-        limit("CoM not too low", low, "m", "node", height, 0.0, scale=0.1),
-        limit("CoM not too low (between)", low, "m", "interval", between, 0.0, scale=0.1),
+        limit("CoM not too low", low, "m", "node", height, scale=0.1),
+        limit("CoM not too low (between)", low, "m", "interval", between, scale=0.1),
     ]
     return [usual] if heel_up else [usual, *flat]
 
@@ -157,8 +149,8 @@ def cop_terms(mass: float, low: float, high: float, slack: float = 0.0) -> list[
 
     scale = 0.1 * mass * GRAVITY
     return [
-        limit("CoP", "SL-P2, times F_z", "N m", "node", room, 0.0, scale=scale, skip=(0, 1)),
-        limit("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, 0.0, scale=scale),
+        limit("CoP", "SL-P2, times F_z", "N m", "node", room, scale=scale, skip=(0, 1)),
+        limit("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, scale=scale),
     ]
 
 
