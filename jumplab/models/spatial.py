@@ -91,8 +91,6 @@ class SpatialModel:
             above = frames[model.parents[j]]
             placement = model.jointPlacements[j]
             inertia = pin.SE3(own.T, np.zeros(3)).act(model.inertias[j])
-            lever = pin.skew(inertia.lever)
-            second = inertia.inertia - inertia.mass * lever @ lever
             self.bodies.append(
                 Link(
                     model.names[j],
@@ -103,7 +101,7 @@ class SpatialModel:
                     own,
                     inertia.mass,
                     _clean(inertia.mass * inertia.lever),
-                    _clean(second),
+                    _clean(inertia.matrix()[3:, 3:]),
                 )
             )
         self.mass = float(sum(b.mass for b in self.bodies))
@@ -439,10 +437,8 @@ class SpatialState:
         In an even motion a joint in the middle holds the limbs of both sides.
         """
         part = joint.part
-        first = part.mass * part.lever
-        lever = pin.skew(part.lever)
-        second = part.inertia - part.mass * lever @ lever
-        total = self._inertial_of(0, part.mass, first, second)
+        second = part.matrix()[3:, 3:]  # about the origin
+        total = self._inertial_of(0, part.mass, part.mass * part.lever, second)
         sums = self._gathered(self._inertial)
         for k in self._counted:
             if self.model.bodies[k].name in joint.joints:

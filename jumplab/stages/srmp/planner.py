@@ -18,6 +18,7 @@ from jumplab.ocp.nlp import WARM
 from jumplab.ocp.solution import quintic
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
+from jumplab.robot.sagittal import in_xz
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import build_problem
 from jumplab.stages.srmp.settings import SrmpSettings
@@ -285,13 +286,11 @@ def _sample_flight(
     # only the ends of the leg's length matter, the rod has no mass
     ends = [(takeoff_length, c["leg"]), (0.0, 0.0), (0.0, 0.0)]
     leg, leg_rate, _ = quintic(ends, flight.duration, t)
-    along = -np.stack([np.sin(theta), np.cos(theta)], -1)
-    across = np.stack([along[:, 1], -along[:, 0]], -1)
-    length, speed, turning = (x[:, None] for x in (leg, leg_rate, c["L"] / rho))
+    way = -1j * np.exp(-1j * theta)  # from CoM to foot, x + iz
     fall = np.array([0.0, -gravity])
     velocity = np.array([c["vel_x"], c["vel_z"]])
     time = t[:, None]
     com = np.array([c["com_x"], c["com_z"]]) + velocity * time + fall * time**2 / 2
     motion = com, velocity + fall * time, np.broadcast_to(fall, com.shape), np.full_like(t, c["L"])
-    foot = length * along, speed * along + length * turning * across
+    foot = in_xz(leg * way), in_xz((leg_rate - 1j * leg * c["L"] / rho) * way)
     return SrmpFlight(t, *motion, rho, rho_v, rho_a, theta, *foot)

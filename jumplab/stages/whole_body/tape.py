@@ -474,24 +474,17 @@ def forces(
     model = robot.model
     data = model.createData()
     joints = [anchor.joint for anchor in on_feet(robot, np.zeros(3))]
-    n = len(q)
-    torques = np.empty((n, model.nv))
-    com = np.empty((n, 3))
-    momentum = np.empty((n, 6))
-    need = np.zeros((n, 6))
-    slopes = np.zeros((n, 2, 6, model.nv))
-    for k in range(n):
-        torques[k] = pin.rnea(model, data, q[k], v[k], a[k])
-        momentum[k] = pin.computeCentroidalMomentum(model, data, q[k], v[k]).vector
-        com[k] = data.com[0]
-        if contacts[k].any():
-            need[k] = needed(q[k], torques[k])
-            pin.computeJointJacobians(model, data, q[k])
-            for i, joint in enumerate(joints):
-                slopes[k, i] = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.WORLD)
+    rows = []
+    for x in zip(q, v, a, strict=True):
+        need = pin.rnea(model, data, *x).copy()
+        momentum = pin.computeCentroidalMomentum(model, data, *x[:2]).vector
+        pin.computeJointJacobians(model, data, x[0])
+        slopes = [pin.getJointJacobian(model, data, j, pin.ReferenceFrame.WORLD) for j in joints]
+        rows.append((need, needed(x[0], need), momentum, data.com[0].copy(), slopes))
+    torques, need, momentum, com, slopes = map(np.array, zip(*rows, strict=True))
     origin, turn = feet
     s = contacts.any(axis=1)
-    total = np.zeros((n, 2, 6))
+    total = np.zeros_like(wrench)
     least = LEAST_LOAD * robot.total_mass * robot.gravity
     soles = (origin + turn @ robot.foot.center)[s]
     missing = need[s] - wrench[s].sum(axis=1)
