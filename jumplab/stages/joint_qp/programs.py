@@ -301,13 +301,12 @@ class FlightQp(PhaseQp):
         """Force on the base that pulls CoM and momentum back to their ballistic values: what
         integration lost.
         """
-        mass = self.body.mass
         t = self.t[k]
         gain = self.options.gains.momentum_drift
         fall = np.array([0.0, 0.0, -self.body.gravity])
         velocity = self.start.com_velocity
         place_error = now.com - (self.start.com + velocity * t + fall * t * t / 2)
-        force = mass * gain.back(place_error, now.com_velocity - (velocity + fall * t))
+        force = self.body.mass * gain.back(place_error, now.com_velocity - (velocity + fall * t))
         moment = -gain.damping * (now.momentum[3:] - self.start.momentum[3:])
         turn = now.base_rotation.T
         arm = now.com - now.q[:3]

@@ -70,7 +70,6 @@ def _shared_terms(phase: str, weights: Any, limits: Limits) -> list[Term]:
     posture = "ours: towards the posture"
     regular = "ours: regulariser", "m/s^2, rad/s^2", "node", "accelerations"
     dynamics = "Sec. IV: base rows, M theta'' + H = J^T F"
-    line = "ours: torque, less above the corner speed"
     stops = "ours: speed and stops after the step"
     return [
         Term("joints", posture, "rad/s^2", "node", joints, weights.posture),
@@ -78,7 +77,7 @@ def _shared_terms(phase: str, weights: Any, limits: Limits) -> list[Term]:
         Term("acceleration", *regular, weights.acceleration),
         Term("base dynamics", dynamics, "N, N m", "node", base, identity=True),
         Term("symmetry", "Sec. IV: S theta'' = 0", "rad/s^2", "node", mirrored),
-        between("torque", line, "N m", torque, torque_range),
+        between("torque", "ours: torque, less above the corner speed", "N m", torque, torque_range),
         between("speed and range", stops, "rad/s^2", accelerations, joint_range),
     ]
 
@@ -156,13 +155,11 @@ def contact_terms(o: Options) -> list[Term]:
 
     foot = "Sec. IV-A: J theta'' + drift = p''_foot"
     flat = "ours: flat foot, or no moment about the toe"
-    push = "ours: F_z >= 0, friction, CoP in the sole"
-    above = "Sec. IV-A: heel above the ground"
     return [
         Term("tiptoe", foot, "m/s^2, rad/s^2", "node", tiptoe),
         Term("foot pitch or toe moment", flat, "rad/s^2, N m", "node", pitch),
-        limit("ground", push, "N, N m", "node", ground),
-        limit("heel", above, "m/s^2", "node", heel, least),
+        limit("ground", "ours: F_z >= 0, friction, CoP in the sole", "N, N m", "node", ground),
+        limit("heel", "Sec. IV-A: heel above the ground", "m/s^2", "node", heel, least),
     ]
 
 
@@ -190,11 +187,9 @@ def flight_terms(o: Options) -> list[Term]:
     def least(p):
         return p.target.floor
 
-    follow = "Sec. IV-B: J_rd theta'' + drift - p''_rd"
     shape = "Sec. IV-B: J_rho theta'' + drift - rho''_ref"
-    above = "ours: toe and heel above the ground"
     return [
-        Term("foot", follow, "m/s^2", "node", foot, w.foot),
+        Term("foot", "Sec. IV-B: J_rd theta'' + drift - p''_rd", "m/s^2", "node", foot, w.foot),
         Term(
             "foot level",
             "ours: sole parallel to the ground",
@@ -204,7 +199,7 @@ def flight_terms(o: Options) -> list[Term]:
             w.foot_level,
         ),
         Term("inertia", shape, "kg m^2/s^2", "node", inertia, w.inertia),
-        limit("ground", above, "m/s^2", "node", ground, least),
+        limit("ground", "ours: toe and heel above the ground", "m/s^2", "node", ground, least),
         *_shared_terms("flight", w, o.limits),
     ]
 

@@ -163,25 +163,22 @@ def landing_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term
         return p.L - p.p.L
 
     heel, toe = envelope.cop
-    soft = "ours: a soft catch"
-    middle = "ours, times F_z / m g"
-    joints = "ours: from the joint speeds"
     unit = "kg m^2/s"
     return [
         *(replace(t, **changes[t.name]) for t in shared),
         *cop_terms(mass, heel + s.cop_margin_m, toe - s.cop_margin_m),
         Term(
             "CoM acceleration",
-            soft,
+            "ours: a soft catch",
             "m/s^2",
             "node",
             "com_acceleration",
             s.w_acceleration,
         ),
-        Term("CoP from the middle", middle, "m", "node", cop, s.w_cop),
+        Term("CoP from the middle", "ours, times F_z / m g", "m", "node", cop, s.w_cop),
         Term("trunk upright", "ours", "rad", "node", lean, s.w_posture),
         Term("landing time", "ours", "s", "end", "duration", s.w_time),
-        limit("leg speed", joints, "m/s", "node", room, skip=(1, 0)),
+        limit("leg speed", "ours: from the joint speeds", "m/s", "node", room, skip=(1, 0)),
         Term("L at touchdown", "after the impact", unit, "start", touched, scale=10.0),
         Term("L at rest", "standing", unit, "end", "L", scale=10.0),
     ]
@@ -203,10 +200,9 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
     low, high = zip(settings.lean_rad, envelope.length, base.turn_rad, base.radius_m, strict=True)
     first, last = ([0.0, envelope.start[1], turn, envelope.start[3]] for turn in (-free, free))
     still = np.array([0.0, 0.0, free, 0.0])  # turning is what L at rest stops
-    impact = "after the impact"
     bounds = (
         Bound("touchdown", "flight's end", "rad, m", "q", start, start, "start"),
-        Bound("touchdown rates", impact, "1/s", "v", rates(-1), rates(1), "start"),
+        Bound("touchdown rates", "after the impact", "1/s", "v", rates(-1), rates(1), "start"),
         Bound("state box", "SL-B1", "rad, m", "q", low, high, "inner"),
         Bound("stance", "standing", "rad, m", "q", first, last, "end"),
         Bound("at rest", "standing", "1/s", "v", -still, still, "end"),

@@ -47,7 +47,6 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     """Costs and constraints all along the launch, SL-* (Sec. III-A)."""
     mg = mass * GRAVITY
     roots = ca.DM(np.sqrt(s.w_jerk))
-    shape = "SL-P4, SL-E5; ours: rho(phi)"
 
     def inertia_room(p):
         low, high = (
@@ -70,7 +69,7 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         Term("L rate", "SL-J3", "N m", "node", "L_rate", s.w_momentum_rate),
         Term("turn", "SL-J4", "rad", "node", lambda p: p.q[2], s.w_turn),
         limit("trunk range", "SL-P1, as path", "rad", "node", "posture", *reach.posture),
-        limit("inertia envelope", shape, "kg m^2", "node", inertia_room),
+        limit("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_room),
         limit("L range", "SL-P5", "kg m^2/s", "node", "L", *s.momentum, scale=10.0),
         limit("unilateral", "ours", "N", "node", push, scale=mg, skip=(0, 1)),
         limit("friction", "ours", "N", "node", cone, scale=mg, skip=(0, 1)),
@@ -95,10 +94,9 @@ def leg_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         return s.speed_share * ca.polyval(ca.DM(reach.speed_fit), p.q[1]) - p.v[1]
 
     torques = "SL-B1 on F; ours: from the joint torques"
-    speeds = "SL-B1; ours: from the joint speeds"
     return [
         limit("leg force", torques, "N", "node", strength, scale=mass * GRAVITY),
-        limit("leg speed", speeds, "m/s", "node", extension),
+        limit("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension),
     ]
 
 
@@ -202,9 +200,7 @@ def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
 
     rate = s.touchdown_inertia_rate
     lean = s.touchdown_lean
-    still = "inertia rate at touchdown"
     below = "ours: foot below the CoM"
-    falling = "ours: not on the way up"
     usual = limit(
         "inertia at touchdown", "ours: rho(phi)", "kg m^2", "end", unusual, *s.touchdown_inertia
     )
@@ -213,9 +209,9 @@ def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
         Term("inertia acceleration", "SF-J1", "kg m^2/s^2", "node", "a", s.w_inertia_accel),
         Term("inertia jerk", "SF-J1", "kg m^2/s^3", "mid", "j", s.w_inertia_jerk),
         Term("rotation", "SF-D1", "rad", "interval", rotation, identity=True),
-        limit(still, "ours", "kg m^2/s", "end", "v", -rate, rate, scale=10.0),
+        limit("inertia rate at touchdown", "ours", "kg m^2/s", "end", "v", -rate, rate, scale=10.0),
         Term("touchdown height", "ours: t_f from both CoM heights", "m", "end", height),
-        limit("falling at touchdown", falling, "m/s", "end", climb, -np.inf, 0.0),
+        limit("falling at touchdown", "ours: not on the way up", "m/s", "end", climb, -np.inf, 0.0),
         limit("lean at touchdown", below, "rad", "end", _foot_angle, -lean, lean),
     ]
 
@@ -283,11 +279,10 @@ def landing_terms(s: SrmpSettings) -> list[Term]:
         end = e["flight"].end
         return _foot_ahead(end) - s.capture_offset_m - s.capture_slope_s * end.c.vel_x
 
-    window = s.capture_window_m
     instead = "ours; replaces SF-E1"  # about the pivot it lands too far ahead, and falls
     return [
         Term("jump length", "SL-E1, foot to foot", "m", "problem", length),
-        limit("capture window", instead, "m", "problem", capture, *window, scale=0.1),
+        limit("capture window", instead, "m", "problem", capture, *s.capture_window_m, scale=0.1),
     ]
 
 

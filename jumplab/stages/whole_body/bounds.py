@@ -71,7 +71,6 @@ def _travel(body: Body, limits: Limits, task: JumpTask, along: np.ndarray) -> fl
     """The most by which the soles could come ``along`` (2,), a unit vector seen from above [m]."""
     reach, start = reach_and_start(body)
     g = task.gravity
-    friction = limits.friction
     edges = np.linspace(0.0, reach, CELLS + 1)
     # cells (weighings, z at take-off, z at touchdown): each with what of it is worst
     low = edges[:-1, None]
@@ -82,7 +81,7 @@ def _travel(body: Body, limits: Limits, task: JumpTask, along: np.ndarray) -> fl
     late = WEIGHINGS * push_s(limits) - 1
     held = (1 + late * np.abs(late)) / (2 * WEIGHINGS)
     up = task.takeoff_speed + WEIGHINGS * (2 * reach - low - start[2])
-    speed = friction * (up + g * held) + WEIGHINGS * (lean - start[:2] @ along)
+    speed = limits.friction * (up + g * held) + WEIGHINGS * (lean - start[:2] @ along)
     way = lean + speed * flight_s + np.sqrt(reach**2 - landing**2)
     turned = 2 * abs(math.sin(task.yaw_rad / 2)) * body.half_m
     return float(np.where(fall < 0, -np.inf, way).max(axis=(1, 2)).min()) + turned

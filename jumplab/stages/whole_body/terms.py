@@ -370,12 +370,11 @@ def flight_rows(m: Mode) -> list[Term]:
         return turned - step**2 * (left.a[at] - right.a[at]) / 12
 
     link = {"identity": True, "group": "flight"}
-    kept = "WF-D1, three components"
     spin = {"scale": SPIN_SCALE, "group": "flight"}
     return [
         Term("ballistic CoM", "WF-D1", "m", "node", com, **link),
         Term("ballistic CoM velocity", "WF-D1", "m/s", "node", velocity, **link),
-        Term("angular momentum", kept, "kg m^2/s", "node", momentum, **spin),
+        Term("angular momentum", "WF-D1, three components", "kg m^2/s", "node", momentum, **spin),
         Term("base turns", "state equation", "rad", "interval", angles, identity=True),
     ]
 
