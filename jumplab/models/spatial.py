@@ -17,6 +17,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from jumplab.errors import RobotError
 from jumplab.robot.locked import LockedJoint
@@ -91,6 +92,8 @@ class SpatialModel:
             above = frames[model.parents[j]]
             placement = model.jointPlacements[j]
             inertia = pin.SE3(own.T, np.zeros(3)).act(model.inertias[j])
+            lever = pin.skew(inertia.lever)
+            second = inertia.inertia - inertia.mass * lever @ lever
             self.bodies.append(
                 Link(
                     model.names[j],
@@ -101,7 +104,7 @@ class SpatialModel:
                     own,
                     inertia.mass,
                     _clean(inertia.mass * inertia.lever),
-                    _clean(inertia.matrix()[3:, 3:]),
+                    _clean(second),
                 )
             )
         self.mass = float(sum(b.mass for b in self.bodies))
@@ -192,7 +195,7 @@ class SpatialModel:
         return configurations, twists, np.hstack([accel, turning, a[:, 6:]])
 
     def charts(
-        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: np.ndarray | None = None
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: ArrayLike = (0.0, 0.0, 0.0)
     ) -> np.ndarray:
         """Charts, rates and accelerations (3, n, 6 + joints) of a motion in Pinocchio's words: the
         inverse of :meth:`to_pinocchio`. The first attitude is within half a turn of the angles
@@ -208,14 +211,13 @@ class SpatialModel:
         rates = np.hstack([turn.apply(speed), rates, v[:, 6:]])
         return np.array([chart, rates, np.hstack([accel, gains, a[:, 6:]])])
 
-    def of_pinocchio(self, q: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+    def of_pinocchio(self, q: np.ndarray, near: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
         """Charts (n, 6 + joints) of configurations (n, nq), their angles continuous.
 
-        The first attitude is within half a turn of the angles ``near`` (3,), by default zero.
+        The first attitude is within half a turn of the angles ``near`` (3,).
         """
         angles = _rotation().from_quat(q[:, 3:7]).as_euler("ZXY")
-        first = np.zeros(3) if near is None else near
-        angles = np.unwrap(np.vstack([first, angles]), axis=0)[1:]
+        angles = np.unwrap(np.vstack([near, angles]), axis=0)[1:]
         return np.hstack([q[:, :3], angles, q[:, 7:]])
 
 

@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from jumplab.io.tape import AIR, FLAT, RATE_HZ, TOE, Tape
 from jumplab.models.spatial import SpatialModel
-from jumplab.ocp.solution import PhaseSolution, quintic
+from jumplab.ocp.solution import PhaseSolution, quintic, resampled
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet
 from jumplab.robot.legs import LOCAL, bring_feet, give_of, least_motion
@@ -216,7 +216,7 @@ def _planned(
     """
     wrench = np.zeros((len(at), 2, 6))
     codes = np.full((len(at), 2), AIR, np.int8)
-    z = np.array([np.interp(at, phase.t, x) for x in phase.z[:, : b.n_forces].T]).T
+    z = resampled(phase.t, phase.z[:, : b.n_forces], at)
     sizes = [len(b.edges) * len(b.points[side]) for side in holds]
     parts = np.split(z, np.cumsum(sizes)[:-1], axis=1)
     for (side, hold), part in zip(holds.items(), parts, strict=True):
