@@ -25,7 +25,7 @@ from jumplab.robot import Robot
 from jumplab.robot.reach import FORCE_SHARE, Reach, reach
 from jumplab.stages.srmp.planner import SrmpStance, grid, on_ground
 from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, rod_at
-from jumplab.stages.srmp.settings import SrmpSettings
+from jumplab.stages.srmp.settings import Range, SrmpSettings
 
 # touchdown
 # ------------------------------------------------------------------------------------------
@@ -76,8 +76,8 @@ class LandingSettings:
     """Weights and bounds of the landing; the paper prints none of these numbers."""
 
     intervals: int = 32  # steps of about 30 ms; twice as many move the CoM by less than 5 mm
-    duration_s: tuple[float, float] = (0.5, 1.2)  # from a quick knee bend to a slow one
-    lean_rad: tuple[float, float] = (-0.8, 0.8)  # box on theta_l
+    duration_s: Range = (0.5, 1.2)  # from a quick knee bend to a slow one
+    lean_rad: Range = (-0.8, 0.8)  # box on theta_l
     cop_margin_m: float = 0.018  # inside the sole's edges: what the landing controller itself keeps
     # of the weight, least vertical force: soles that are hardly loaded slip and tip
     press_share: float = 0.7
