@@ -292,9 +292,8 @@ class FlightQp(PhaseQp):
             base_force=self._drift(k, now),
         )
         if self.t[k] <= self.t[-1] / 2:  # coming down, the surface is the landing's business
-            height = np.stack([now.tip.place[:, 2], now.heel.place[:, 2]], 1).ravel()
-            speed = np.stack([now.tip.velocity[:, 2], now.heel.velocity[:, 2]], 1).ravel()
-            target.floor = self._floor(height - self.ground, speed)
+            height = now.vertical("place") - self.ground
+            target.floor = self._floor(height, now.vertical("velocity"))
         return target
 
     def _drift(self, k: int, now: FullTerms) -> np.ndarray:

@@ -179,10 +179,9 @@ def flight_terms(o: Options) -> list[Term]:
         return p.inertia_acceleration - p.target.inertia_accel
 
     def ground(p):
-        ends = p.quantities.tip, p.quantities.heel
-        vertical = np.stack([x.jacobian[:, 2] for x in ends], 1).reshape(4, -1)
-        drift = np.stack([x.drift[:, 2] for x in ends], 1).ravel()
-        return p.affine(vertical, drift).named(_both(["toe", "heel"]))
+        x = p.quantities
+        rows = p.affine(x.vertical("jacobian"), x.vertical("drift"))
+        return rows.named(_both(["toe", "heel"]))
 
     def least(p):
         return p.target.floor

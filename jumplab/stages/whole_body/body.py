@@ -16,7 +16,7 @@ from jumplab.robot.legs import leg_columns
 from jumplab.robot.reduction import even_masses
 from jumplab.robot.stance import knees, leg_length, stance_configuration
 from jumplab.stages.whole_body.coordinates import BASE
-from jumplab.stages.whole_body.shapes import Box, boxes
+from jumplab.stages.whole_body.shapes import Box
 from jumplab.task import GRAVITY
 
 # of half the length of a shank's box, where a platform's edge may meet it
@@ -183,8 +183,17 @@ class Body:
 
     @cached_property
     def shapes(self) -> list[Box]:
-        """Boxes around the collision shapes, in the same order."""
-        return boxes(self.geometry, self.model)
+        """Boxes around the collision shapes [m], in the same order."""
+        out = []
+        for shape in self.geometry.geometryObjects:
+            shape.geometry.computeLocalAABB()
+            low = shape.geometry.aabb_local.min_
+            high = shape.geometry.aabb_local.max_
+            body = shape.parentJoint - 1
+            centre = self.model.local(body + 1, shape.placement.act((low + high) / 2))
+            axes = self.model.bodies[body].own.T @ shape.placement.rotation
+            out.append(Box(shape.name, body, centre, axes, (high - low) / 2))
+        return out
 
     def _shapes_of(self, bodies: set[int]) -> list[tuple[Box, np.ndarray]]:
         """Boxes of some bodies, each with the way from its middle to its far end (3,) [m]."""
