@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
@@ -208,17 +209,10 @@ class SrmpPlanner:
         weights = self.changes.spread(self.nlp.problem, weights)
         if near is not None:
             known = near.solution
-            try:
-                solution = self._warm.solve(
-                    data,
-                    known.guess(),
-                    weights=weights,
-                    explain=False,
-                    multipliers=known.multipliers,
-                )
+            options = dict(weights=weights, multipliers=known.multipliers, explain=False)
+            with suppress(SolverError):  # as if there had been none
+                solution = self._warm.solve(data, known.guess(), **options)
                 return sample_plan(task, solution, self.reach)
-            except SolverError:
-                pass  # as if there had been none
         guess = naive_guess(task, self.reach, self.settings)
         return sample_plan(task, self.nlp.solve(data, guess, weights=weights), self.reach)
 

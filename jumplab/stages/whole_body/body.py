@@ -62,7 +62,7 @@ class Body:
         self.stance = self.model.of_pinocchio(configuration[None])[0]
         data = robot.model.createData()
         pin.forwardKinematics(robot.model, data, configuration)
-        self.places = np.array([(data.oMi[x.joint] * x.placement).translation for x in tips])
+        self.places = np.array([x.place(data).translation for x in tips])
         self.ankle_m = float(data.oMi[tips[0].joint].translation[2])
 
     def _on_feet(self, point: np.ndarray) -> list[np.ndarray]:

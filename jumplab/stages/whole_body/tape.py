@@ -350,17 +350,17 @@ def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[...
     tree = body.model.model
     data = tree.createData()
     give = give_of(body.robot)
-    feet = on_feet(body.robot, np.zeros(3))
+    anchors = on_feet(body.robot, np.zeros(3))
+    feet = [anchors[side] for side in sides]
 
     def slopes(q: np.ndarray) -> np.ndarray:
         """(6 k, nv) of the feet's twists, in their axes."""
         pin.computeJointJacobians(tree, data, q)
-        each = [(feet[side].joint, feet[side].placement) for side in sides]
-        return np.vstack([pin.getFrameJacobian(tree, data, *foot, LOCAL) for foot in each])
+        return np.vstack([foot.slope(tree, data, LOCAL) for foot in feet])
 
     q, v, _ = (x[0] for x in body.model.to_pinocchio(*end))
     speeds = slopes(q) @ v
-    goals = {feet[side]: data.oMi[feet[side].joint] * feet[side].placement for side in sides}
+    goals = {foot: foot.place(data) for foot in feet}
 
     def missed(q: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
         there, _ = bring_feet(tree, data, q[0], goals, give)
