@@ -218,11 +218,9 @@ class FullBody:
 
     def _both(self, place: str) -> PointMotion:
         """Motion of a point of both feet, stacked."""
-        left, right = (
-            vars(point_motion(self.model, self.data, self.anchors[f"{side}_{place}"]))
-            for side in SIDES
-        )
-        return PointMotion(**{name: np.stack([x, right[name]]) for name, x in left.items()})
+        anchors = (self.anchors[f"{side}_{place}"] for side in SIDES)
+        motions = (vars(point_motion(self.model, self.data, x)).values() for x in anchors)
+        return PointMotion(*map(np.stack, zip(*motions, strict=True)))
 
 
 def pitch_inertia(model: pin.Model, data: pin.Data, q: np.ndarray) -> tuple[float, np.ndarray]:

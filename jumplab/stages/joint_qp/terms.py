@@ -9,15 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InputError, quoted
+from jumplab.errors import InputError
 from jumplab.models.full import SIDES, FullBody, force_target
 from jumplab.ocp import Phase, Problem, Term
-from jumplab.ocp.changes import ends
+from jumplab.ocp.changes import check_weight, ends
 from jumplab.ocp.problem import limit
 from jumplab.robot.contact import wrench_rows
 from jumplab.stages.changes import StageChanges
@@ -238,11 +237,7 @@ def changed_problem(
     problem = replace(changes, weights={}, off=()).applied(build_problem(options), look)
     weights = {}
     for name, factor in changes.weights.items():
-        if isinstance(factor, bool) or not isinstance(factor, Real) or not 0 <= factor < np.inf:
-            raise InputError(
-                f"weight {name!r} of 'joint qp' = {quoted(factor)}: "
-                f"its factor must be a number of 0 or more"
-            )
+        check_weight(f"weight {name!r} of 'joint qp'", factor, "its factor")
         weights |= {"/".join(cost): factor * usual for cost, usual in problem.costs(name).items()}
     return replace(changes, terms={}, weights=weights).applied(problem)
 

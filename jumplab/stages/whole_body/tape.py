@@ -507,8 +507,8 @@ def _shared(
     at its centre of pressure, which without load is the middle of its sole (n, 2, 3) [m].
     """
     lift = wrench[..., 2:3]
-    pressed = np.stack([-wrench[..., 4], wrench[..., 3], 0 * wrench[..., 2]], -1)
-    at = np.where(lift > 0, pressed / np.where(lift > 0, lift, 1.0), soles)
+    lever = np.cross([0.0, 0.0, 1.0], wrench[..., 3:])
+    at = np.where(lift > 0, lever / np.where(lift > 0, lift, 1.0), soles)
     load = np.maximum(lift, least) * (contacts > 0)[..., None]
     share = load / load.sum(axis=1, keepdims=True)
     force = share * missing[:, None, :3]
