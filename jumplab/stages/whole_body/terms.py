@@ -58,7 +58,7 @@ def smoothness(m: Mode) -> list[Term]:
     terms = [
         Term("acceleration", origin, "rad/s^2", "node", lambda p: m.moving(p.a), w.acceleration),
         Term("jerk", origin, "rad/s^3", "mid", lambda p: m.moving(p.j), w.jerk),
-        Term("torque", "ours: effort", "N m", "node", lambda p: p.joint_torques, w.torque),
+        Term("torque", "ours: effort", "N m", "node", "joint_torques", w.torque),
     ]
     if not m.flying:
         terms.append(
@@ -419,14 +419,13 @@ def touchdown_rows(m: Mode) -> list[Term]:
     bent = min(lim.touchdown_knee[0], body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
     trunk = rates_within(m, lim.touchdown_trunk_rate, np.eye(3)[0][angles])
     rate = lim.touchdown_joint_rate
-    rates = "joint rates at touchdown", "WF-E1, relaxed", "rad/s", "end"
     turning = "trunk rates at touchdown", "ours", "rad/s", "end"
     return [
         Term("vertical take-off speed", "SL-E2, WL-E1", "m/s", "start", takeoff),
         *touchdown_feet(m),
         limit("attitude at touchdown", "ours", "rad", "end", attitude, low, high),
         limit("knees at touchdown", "ours: stroke", "rad", "end", knees, *bent),
-        limit(*rates, lambda p: p.rates, -rate, rate),
+        limit("joint rates at touchdown", "WF-E1, relaxed", "rad/s", "end", "rates", -rate, rate),
         limit(*turning, lambda p: p.v[free.turns], *trunk),
         *upright_waist(m),
         *ankle_stroke(m),
