@@ -474,22 +474,25 @@ def forces(
     model = robot.model
     data = model.createData()
     joints = [anchor.joint for anchor in on_feet(robot, np.zeros(3))]
+    s = contacts.any(axis=1)
     rows = []
-    for x in zip(q, v, a, strict=True):
+    slopes = []
+    for *x, stands in zip(q, v, a, s, strict=True):
         need = pin.rnea(model, data, *x).copy()
         momentum = pin.computeCentroidalMomentum(model, data, *x[:2]).vector
-        pin.computeJointJacobians(model, data, x[0])
-        slopes = [pin.getJointJacobian(model, data, j, pin.ReferenceFrame.WORLD) for j in joints]
-        rows.append((need, needed(x[0], need), momentum, data.com[0].copy(), slopes))
-    torques, need, momentum, com, slopes = map(np.array, zip(*rows, strict=True))
+        rows.append((need, needed(x[0], need), momentum, data.com[0].copy()))
+        if stands:
+            pin.computeJointJacobians(model, data, x[0])
+            world = pin.ReferenceFrame.WORLD
+            slopes.append([pin.getJointJacobian(model, data, j, world) for j in joints])
+    torques, need, momentum, com = map(np.array, zip(*rows, strict=True))
     origin, turn = feet
-    s = contacts.any(axis=1)
     total = np.zeros_like(wrench)
     least = LEAST_LOAD * robot.total_mass * robot.gravity
     soles = (origin + turn @ robot.foot.center)[s]
     missing = need[s] - wrench[s].sum(axis=1)
     total[s] = wrench[s] + _shared(wrench[s], soles, contacts[s], missing, least)
-    torques -= np.einsum("nkij,nki->nj", slopes, total)
+    torques[s] -= np.einsum("nkij,nki->nj", slopes, total[s])
     total[..., 3:] -= np.cross(origin, total[..., :3])
     tau = torques[:, 6:] + robot.limits.lost(v[:, 6:])
     extra = {
