@@ -15,7 +15,7 @@ from jumplab.control import STEP_S
 from jumplab.control.kinematics import Gauge, Motion, about_vertical, turned, yaw_of
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.robot.contact import WORLD, on_feet
+from jumplab.robot.contact import on_feet
 from jumplab.robot.legs import leg_columns, size
 from jumplab.robot.stance import knees
 
@@ -193,9 +193,9 @@ class Reaim:
         slopes = []
         misses = []
         for anchor, planned, goal in zip(self._anchors, self._attitudes, goals, strict=True):
-            sole = data.oMi[anchor.joint] * anchor.placement
+            sole = anchor.place(data)
             arm = sole.translation - data.com[0]
-            foot = pin.getFrameJacobian(model, data, anchor.joint, anchor.placement, WORLD)
+            foot = anchor.slope(model, data)
             turning = np.vstack([-pin.skew(arm) @ turns - com, turns])
             slopes.append(foot[:, 6 + joints] + turning)
             misses += [goal - arm, pin.log3(planned @ sole.rotation.T)]

@@ -93,6 +93,13 @@ class FullTerms:
         """Its drift (2, 3)."""
         return self.sole.drift[:, :3] - self.B_c
 
+    def vertical(self, name: str) -> np.ndarray:
+        """Along z, "place", "velocity", "jacobian" or "drift" (4, ...) of left toe, left heel,
+        right toe, right heel.
+        """
+        both = np.stack([getattr(x, name)[:, 2] for x in (self.tip, self.heel)], 1)
+        return both.reshape(4, *both.shape[2:])
+
     @property
     def J(self) -> np.ndarray:
         """J^js (12, nv): both tiptoes, so that the ground acts on the robot as J^T F."""
@@ -211,11 +218,9 @@ class FullBody:
 
     def _both(self, place: str) -> PointMotion:
         """Motion of a point of both feet, stacked."""
-        left, right = (
-            vars(point_motion(self.model, self.data, self.anchors[f"{side}_{place}"]))
-            for side in SIDES
-        )
-        return PointMotion(**{name: np.stack([x, right[name]]) for name, x in left.items()})
+        anchors = (self.anchors[f"{side}_{place}"] for side in SIDES)
+        motions = (vars(point_motion(self.model, self.data, x)).values() for x in anchors)
+        return PointMotion(*map(np.stack, zip(*motions, strict=True)))
 
 
 def pitch_inertia(model: pin.Model, data: pin.Data, q: np.ndarray) -> tuple[float, np.ndarray]:

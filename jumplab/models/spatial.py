@@ -17,6 +17,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from jumplab.errors import RobotError
 from jumplab.robot.locked import LockedJoint
@@ -169,11 +170,11 @@ class SpatialModel:
         """
         return _clean(self.bodies[joint - 1].own.T @ np.asarray(point, float))
 
-    def attitudes(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of charts (n, >= 6), the base's attitudes (n, 3, 3), and the slopes (n, 3, 3) of its
-        angular velocity, in its own axes, along the rates of yaw, roll and pitch.
+    @staticmethod
+    def attitudes(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of yaw, roll and pitch (n, 3), the base's attitudes (n, 3, 3), and the slopes (n, 3, 3)
+        of its angular velocity, in its own axes, along their rates.
         """
-        angles = q[:, 3:6]
         return _rotation().from_euler("ZXY", angles).as_matrix(), _slopes(angles)
 
     def to_pinocchio(
@@ -186,17 +187,17 @@ class SpatialModel:
         turn = _rotation().from_euler("ZXY", angles)  # its quaternions follow whole turns
         slope, change = _slopes(angles), _slopes(angles, rates)
         speed = turn.apply(np.array(v[:, :3]), inverse=True)
-        spin = _times(slope, rates)
+        spin = np.matvec(slope, rates)
         accel = turn.apply(np.array(a[:, :3]), inverse=True) - np.cross(spin, speed)
-        turning = _times(slope, gains) + _times(change, rates)
+        turning = np.matvec(slope, gains) + np.matvec(change, rates)
         configurations = np.hstack([q[:, :3], turn.as_quat(), q[:, 6:]])
         twists = np.hstack([speed, spin, v[:, 6:]])
         return configurations, twists, np.hstack([accel, turning, a[:, 6:]])
 
     def charts(
-        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Charts, rates and accelerations (n, 6 + joints) of a motion in Pinocchio's words: the
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> np.ndarray:
+        """Charts, rates and accelerations (3, n, 6 + joints) of a motion in Pinocchio's words: the
         inverse of :meth:`to_pinocchio`. The first attitude is within half a turn of the angles
         ``near`` (3,)."""
         chart = self.of_pinocchio(q, near)
@@ -204,20 +205,19 @@ class SpatialModel:
         speed = np.array(v[:, :3])  # SciPy turns no read-only arrays
         spin = v[:, 3:6]
         back = np.linalg.inv(_slopes(chart[:, 3:6]))
-        rates = _times(back, spin)
-        gains = _times(back, a[:, 3:6] - _times(_slopes(chart[:, 3:6], rates), rates))
+        rates = np.matvec(back, spin)
+        gains = np.matvec(back, a[:, 3:6] - np.matvec(_slopes(chart[:, 3:6], rates), rates))
         accel = turn.apply(a[:, :3] + np.cross(spin, speed))
         rates = np.hstack([turn.apply(speed), rates, v[:, 6:]])
-        return chart, rates, np.hstack([accel, gains, a[:, 6:]])
+        return np.array([chart, rates, np.hstack([accel, gains, a[:, 6:]])])
 
-    def of_pinocchio(self, q: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+    def of_pinocchio(self, q: np.ndarray, near: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
         """Charts (n, 6 + joints) of configurations (n, nq), their angles continuous.
 
-        The first attitude is within half a turn of the angles ``near`` (3,), by default zero.
+        The first attitude is within half a turn of the angles ``near`` (3,).
         """
         angles = _rotation().from_quat(q[:, 3:7]).as_euler("ZXY")
-        first = np.zeros(3) if near is None else near
-        angles = np.unwrap(np.vstack([first, angles]), axis=0)[1:]
+        angles = np.unwrap(np.vstack([near, angles]), axis=0)[1:]
         return np.hstack([q[:, :3], angles, q[:, 7:]])
 
 
@@ -242,17 +242,15 @@ def _slopes(angles: np.ndarray, rates: np.ndarray | None = None) -> np.ndarray:
     return np.array([yawing, rolling, pitching]).transpose(2, 1, 0)
 
 
-def _times(matrices: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Products (n, 3) of matrices (n, 3, 3) and columns (n, 3)."""
-    return np.einsum("nij,nj->ni", matrices, columns)
-
-
 class Turn:
-    """A rotation about a coordinate axis by an angle, after a fixed one (3, 3)."""
+    """A rotation about a coordinate axis by the angle in a ``column`` of the chart ``q``, after a
+    fixed one (3, 3)."""
 
-    def __init__(self, axis: int, angle: ca.SX, fixed: np.ndarray | None = None):
+    def __init__(self, q: ca.SX, column: int, axis: int, fixed: np.ndarray | None = None):
         i = (axis + 1) % 3
         j = (axis + 2) % 3
+        angle = q[column]
+        self.column = column
         self.axis = axis
         self.fixed = ca.sparsify(ca.DM(np.eye(3) if fixed is None else fixed))
         self.turn = ca.SX(3, 3)
@@ -301,9 +299,8 @@ class SpatialState:
         self.v = v
         self.a = a
         self.gravity = gravity
-        # of each body its turns, with their columns in the chart
-        base = [(3 + k, Turn(axis, q[3 + k])) for k, axis in enumerate(ATTITUDE_AXES)]
-        joints = [[(k, Turn(b.axis, q[k], b.turn))] for k, b in enumerate(model.bodies[1:], 6)]
+        base = [Turn(q, 3 + k, axis) for k, axis in enumerate(ATTITUDE_AXES)]
+        joints = [[Turn(q, k, b.axis, b.turn)] for k, b in enumerate(model.bodies[1:], 6)]
         self._turns = [base, *joints]
         self._even = even
         self._counted = model.left_half if even else tuple(range(len(model.bodies)))
@@ -316,8 +313,8 @@ class SpatialState:
         out = []
         for b, turns in zip(self.model.bodies, self._turns, strict=True):
             spin = out[b.parent] if out else ca.SX.zeros(3)
-            for i, turn in turns:
-                spin = turn.into(spin) + along(turn.axis, self.v[i])
+            for turn in turns:
+                spin = turn.into(spin) + along(turn.axis, self.v[turn.column])
             out.append(spin)
         return out
 
@@ -325,7 +322,7 @@ class SpatialState:
     def _velocities(self) -> list[ca.SX]:
         """Velocities of the origins, less that of the base's."""
         out = [ca.SX.zeros(3)]
-        for b, ((_, turn),) in zip(self.model.bodies[1:], self._turns[1:], strict=True):
+        for b, (turn,) in zip(self.model.bodies[1:], self._turns[1:], strict=True):
             out.append(turn.into(out[b.parent] + cross(self._spins[b.parent], b.place)))
         return out
 
@@ -342,11 +339,12 @@ class SpatialState:
             else:
                 linear = self.a[:3] + along(2, self.gravity)
                 angular = spin = ca.SX.zeros(3)
-            for i, turn in turns:
-                rate = along(turn.axis, self.v[i])
+            for turn in turns:
+                rate = along(turn.axis, self.v[turn.column])
                 linear = turn.into(linear)
                 spin = turn.into(spin)
-                angular = turn.into(angular) + cross(spin, rate) + along(turn.axis, self.a[i])
+                angular = turn.into(angular) + cross(spin, rate)
+                angular = angular + along(turn.axis, self.a[turn.column])
                 spin = spin + rate
             out.append((linear, angular))
         return out
@@ -358,7 +356,7 @@ class SpatialState:
         for b, turns in zip(self.model.bodies, self._turns, strict=True):
             above, place = out[b.parent] if out else (ca.SX.eye(3), ca.SX.zeros(3))
             turned = above
-            for _, turn in turns:
+            for turn in turns:
                 turned = turned @ turn.fixed @ turn.turn
             out.append((turned, place + above @ ca.DM(b.place) if out else place))
         return out
@@ -372,39 +370,32 @@ class SpatialState:
         beside = self._even and self.model.across[k] is None
         return self.model.across[self.model.bodies[k].parent] if beside else None
 
-    def _gathered(
-        self, parts: Mapping[int, tuple[ca.SX, ca.SX]]
-    ) -> tuple[ca.SX, ca.SX, dict[int, ca.SX]]:
-        """Sums over the tree of (force-like, moment-like) vectors at the bodies' origins: at the
-        base's origin in world axes, and per body the component of the moment about its joint's
-        axis."""
-        parts = dict(parts)
-        axial = {}
+    def _gathered(self, parts: Mapping[int, ca.SX]) -> dict[int, ca.SX]:
+        """Force-like and moment-like vectors (6,) at the bodies' origins, in their axes, each with
+        those of all bodies beyond."""
+        sums = dict(parts)
         for k in self._counted[:0:-1]:
-            b = self.model.bodies[k]
-            axial[k] = parts[k][1][b.axis]
-            force, moment = self._at_parent(k, *parts[k])
-            parts[b.parent] = parts[b.parent][0] + force, parts[b.parent][1] + moment
-        return *(self._to_world(x) for x in parts[0]), axial
+            parent = self.model.bodies[k].parent
+            sums[parent] = sums[parent] + self._at_parent(k, sums[k])
+        return sums
 
-    def _at_parent(
-        self, k: int, force: ca.SX, moment: ca.SX, both: bool = True
-    ) -> tuple[ca.SX, ca.SX]:
-        """A (force-like, moment-like) pair of a body at its parent's origin, in its axes; of
-        ``both`` sides of an even motion where they meet."""
-        ((_, turn),) = self._turns[k]
-        force = turn.out(force)
-        moment = turn.out(moment) + cross(self.model.bodies[k].place, force)
+    def _at_parent(self, k: int, x: ca.SX, both: bool = True) -> ca.SX:
+        """Such vectors (6,) of a body at its parent's origin, in its axes; of ``both`` sides of an
+        even motion where they meet."""
+        (turn,) = self._turns[k]
+        force, moment = (turn.out(y) for y in ca.vertsplit(x, 3))
+        moment = moment + cross(self.model.bodies[k].place, force)
         across = self._doubled(k)
-        if across is None or not both:
-            return force, moment
-        return 2 * (force - along(across, force[across])), 2 * along(across, moment[across])
+        if across is not None and both:
+            force = 2 * (force - along(across, force[across]))
+            moment = 2 * along(across, moment[across])
+        return ca.vertcat(force, moment)
 
-    def _to_world(self, x: ca.SX) -> ca.SX:
-        """A vector (3,) of the base in world axes."""
-        for _, turn in self._turns[0][::-1]:
-            x = turn.out(x)
-        return x
+    def _in_world(self, x: ca.SX) -> list[ca.SX]:
+        """Vectors (3,) of the base, one below the other, in world axes."""
+        for turn in self._turns[0][::-1]:
+            x = ca.vertcat(*(turn.out(y) for y in ca.vertsplit(x, 3)))
+        return ca.vertsplit(x, 3)
 
     def dynamics(
         self, wrenches: Mapping[int, tuple[ca.SX, ca.SX]] = {}
@@ -418,20 +409,21 @@ class SpatialState:
         """
         parts = dict(self._inertial)
         for k in parts.keys() & wrenches.keys():
-            parts[k] = tuple(a - b for a, b in zip(parts[k], wrenches[k], strict=True))
-        force, moment, axial = self._gathered(parts)
-        torques = [axial.get(k, ca.SX(0)) for k in range(1, len(self.model.bodies))]
-        return force, moment, ca.vertcat(ca.SX(0, 1), *torques) + self.model.armature * self.a[6:]
+            parts[k] = parts[k] - ca.vertcat(*wrenches[k])
+        sums = self._gathered(parts)
+        bodies = enumerate(self.model.bodies)
+        _, *axial = (sums[k][3 + b.axis] if k in sums else ca.SX(0) for k, b in bodies)
+        torques = ca.vertcat(ca.SX(0, 1), *axial) + self.model.armature * self.a[6:]
+        return *self._in_world(sums[0]), torques
 
     @cached_property
-    def _inertial(self) -> dict[int, tuple[ca.SX, ca.SX]]:
-        """(force, moment about its origin) that the motion of each body needs, in its axes."""
+    def _inertial(self) -> dict[int, ca.SX]:
+        """Force, and moment about its origin (6,), that the motion of each body needs, in its
+        axes."""
         counted = {k: self.model.bodies[k] for k in self._counted}
         return {k: self._inertial_of(k, b.mass, b.first, b.second) for k, b in counted.items()}
 
-    def _inertial_of(
-        self, k: int, mass: float, first: np.ndarray, second: np.ndarray
-    ) -> tuple[ca.SX, ca.SX]:
+    def _inertial_of(self, k: int, mass: float, first: np.ndarray, second: np.ndarray) -> ca.SX:
         """The same of anything that is rigid with a body; see :class:`Link`."""
         spin = self._spins[k]
         linear, angular = self._accelerations[k]
@@ -439,18 +431,7 @@ class SpatialState:
         second = ca.DM(second)
         force = mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
         moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
-        return force, moment
-
-    def _passed(self, k: int, both: bool = True) -> tuple[ca.SX, ca.SX]:
-        """(force, moment) at the origin of its parent, in its axes, that all beyond a joint needs,
-        see :meth:`_at_parent`; nothing touches it."""
-        force, moment = self._inertial[k]
-        for child in self._counted:
-            if child and self.model.bodies[child].parent == k:
-                more = self._passed(child)
-                force = force + more[0]
-                moment = moment + more[1]
-        return self._at_parent(k, force, moment, both)
+        return ca.vertcat(force, moment)
 
     def locked_torque(self, joint: LockedJoint) -> ca.SX:
         """Torque with which a joint that never moves holds its part on the base [N m].
@@ -458,19 +439,16 @@ class SpatialState:
         In an even motion a joint in the middle holds the limbs of both sides.
         """
         part = joint.part
-        first = part.mass * part.lever
-        lever = pin.skew(part.lever)
-        second = part.inertia - part.mass * lever @ lever
-        force, moment = self._inertial_of(0, part.mass, first, second)
+        second = part.matrix()[3:, 3:]  # about the origin
+        total = self._inertial_of(0, part.mass, part.mass * part.lever, second)
+        sums = self._gathered(self._inertial)
         for k in self._counted:
             if self.model.bodies[k].name in joint.joints:
-                more = self._passed(k, abs(joint.place[1]) < EXACT_M)
-                force = force + more[0]
-                moment = moment + more[1]
-        return ca.dot(ca.DM(joint.axis), moment - cross(ca.DM(joint.place), force))
+                total = total + self._at_parent(k, sums[k], abs(joint.place[1]) < EXACT_M)
+        return ca.dot(ca.DM(joint.axis), total[3:] - cross(ca.DM(joint.place), total[:3]))
 
     @cached_property
-    def _momenta(self) -> tuple[ca.SX, ca.SX]:
+    def _momenta(self) -> list[ca.SX]:
         """Linear momentum, and angular momentum about the base's origin, of a base whose origin
         rests.
         """
@@ -481,8 +459,8 @@ class SpatialState:
             linear = self._velocities[k]
             first = ca.DM(b.first)
             angular = ca.DM(b.second) @ spin + cross(first, linear)
-            parts[k] = b.mass * linear + cross(spin, first), angular
-        return self._gathered(parts)[:2]
+            parts[k] = ca.vertcat(b.mass * linear + cross(spin, first), angular)
+        return self._in_world(self._gathered(parts)[0])
 
     @cached_property
     def com_from_base(self) -> ca.SX:
@@ -490,12 +468,12 @@ class SpatialState:
         parts = {k: ca.SX(ca.DM(self.model.bodies[k].first)) for k in self._counted}
         for k in self._counted[:0:-1]:
             b = self.model.bodies[k]
-            ((_, turn),) = self._turns[k]
+            (turn,) = self._turns[k]
             more = turn.out(parts[k]) + self.model.carried[k] * ca.DM(b.place)
             if (across := self._doubled(k)) is not None:
                 more = 2 * (more - along(across, more[across]))
             parts[b.parent] += more
-        return self._to_world(parts[0]) / self.model.mass
+        return self._in_world(parts[0])[0] / self.model.mass
 
     @property
     def com(self) -> ca.SX:
@@ -560,7 +538,7 @@ class SpatialState:
         """Place of a point of a body (3,) [m], seen from the base's origin in the base's axes."""
         place = ca.SX(ca.DM(local))
         while body:
-            ((_, turn),) = self._turns[body]
+            (turn,) = self._turns[body]
             place = turn.out(place) + ca.DM(self.model.bodies[body].place)
             body = self.model.bodies[body].parent
         return place

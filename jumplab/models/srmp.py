@@ -49,7 +49,7 @@ class SrmpState:
     @property
     def com(self) -> ca.SX:
         """CoM from the pivot [m] (2,)."""
-        return self.q[1] * ca.vertcat(ca.sin(self.q[0]), ca.cos(self.q[0]))
+        return self.q[1] * self._polar[0]
 
     @cached_property
     def _polar(self):

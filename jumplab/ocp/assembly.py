@@ -109,17 +109,16 @@ class Assembled:
             return np.empty((len(nodes), 0), int)
         f = functions["rows"]
         counts = [f.size1_out(i) for i in range(f.n_out())]
-        columns = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-        kept = np.ones((len(nodes), sum(counts)), bool)
-        for term, columns_of in zip(part.constraints, columns, strict=True):
-            first, last = term.skip
-            kept[:first, columns_of] = False
-            kept[len(nodes) - last :, columns_of] = False
+        skips = np.array([t.skip for t in part.constraints])
+        first, last = np.repeat(skips, counts, axis=0).T
+        place = np.arange(len(nodes))[:, None]
+        kept = (place >= first) & (place < len(nodes) - last)
         number = np.where(kept, self.n_rows - 1 + np.cumsum(kept).reshape(kept.shape), -1)
         self.n_rows += int(kept.sum())
-        for term, columns_of in zip(part.constraints, columns, strict=True):
-            stay = kept[:, columns_of[0]]
-            self.rows.append(Rows(part.owner, term, nodes[stay], number[stay][:, columns_of]))
+        columns = np.split(number, np.cumsum(counts)[:-1], axis=1)
+        for term, index in zip(part.constraints, columns, strict=True):
+            stay = index[:, 0] >= 0
+            self.rows.append(Rows(part.owner, term, nodes[stay], index[stay]))
         return number
 
     def held_hessian(self, hold: float) -> ca.Function:

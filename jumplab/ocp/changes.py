@@ -61,7 +61,7 @@ def changed(
     asked: dict[tuple[str, str], float] = {}
     for name, weight in weights.items():
         costs = problem.costs(name)
-        _check_weight(name, weight)
+        check_weight(f"weight {name!r}", weight)
         asked |= dict.fromkeys(costs, float(weight))
     for owner, term in problem.terms():
         if term.identity and is_named(owner, term, off):
@@ -90,9 +90,10 @@ def changed(
     return replace(out, own={name: digest for name, digest in problem.own.items() if name in left})
 
 
-def _check_weight(name: str, weight: Any) -> None:
+def check_weight(words: str, weight: Any, it: str = "it") -> None:
+    """Refuse (:class:`InputError`) a weight, "weight 'name'" in ``words``, that cannot be one."""
     if isinstance(weight, bool) or not isinstance(weight, Real) or not 0 <= weight < np.inf:
-        raise InputError(f"weight {name!r} = {quoted(weight)}: it must be a number of 0 or more")
+        raise InputError(f"{words} = {quoted(weight)}: {it} must be a number of 0 or more")
 
 
 def _with(problem: Problem, owner: str, term: Term, look: Callable) -> Problem:
@@ -117,7 +118,7 @@ def _with(problem: Problem, owner: str, term: Term, look: Callable) -> Problem:
     if "/" in term.name:
         raise InputError(f"{who}: a name must not hold a '/'")
     if term.is_cost:
-        _check_weight(term.name, term.weight)
+        check_weight(f"weight {term.name!r}", term.weight)
     phases = tuple(
         replace(p, terms=(*p.terms, term)) if p.name == owner else p for p in problem.phases
     )

@@ -130,19 +130,20 @@ def _least_violation(a: Assembled, posed: Posed, seconds: float) -> tuple[np.nda
     n = a.size
     m = len(index)
     place = scatter(index, a.n_rows)
+    gives = ca.horzcat(-place, place)
     w = ca.MX.sym("w", n + 2 * m)
     p = ca.MX.sym("p", a.p_size)
     lam_f = ca.MX.sym("lam_f")
     lam_g = ca.MX.sym("lam_g", a.n_rows)
-    x, over, under = ca.vertsplit(w, [0, n, n + m, n + 2 * m])
+    x, slack = ca.vertsplit(w, [0, n, n + 2 * m])
     f, g = a.nlp(x, p)
     hessian = a.hess_lag(x, p, COST_SHARE * lam_f, lam_g)
     functions = nlp_functions(
         (w, p, lam_f, lam_g),
-        COST_SHARE * f + ca.sum1(over) + ca.sum1(under),
-        g - place @ over + place @ under,
+        COST_SHARE * f + ca.sum1(slack),
+        g + gives @ slack,
         ca.vertcat(COST_SHARE * a.grad_f(x, p)[1], ca.DM.ones(2 * m)),
-        ca.horzcat(a.jac_g(x, p)[1], -place, place),
+        ca.horzcat(a.jac_g(x, p)[1], gives),
         ca.diagcat(hessian, ca.MX(2 * m, 2 * m)),
     )
     g0 = a.nlp(posed.x0, posed.p)[1].full().ravel()[index]

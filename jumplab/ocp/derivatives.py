@@ -178,15 +178,10 @@ class Formulator:
 
     def formulas(self, part: Part) -> Formulas:
         """The terms of a part in symbols; costs count for the time [s] that they span."""
-        if part.place == "problem":
-            local, seen = self._ends()
-            data = ca.SX(0, 1)
-            spans = {}
-        else:
-            if part.owner not in self._known:
-                self._known[part.owner] = self._within(self._phases[part.owner])
-            node, step, data, seen, spans = self._known[part.owner]
-            local = step if part.place == "interval" else node
+        if part.owner not in self._known:
+            phase = self._phases.get(part.owner)
+            self._known[part.owner] = self._within(phase) if phase else self._ends()
+        variables, data, seen, spans = self._known[part.owner]
         values = [_column(self.problem.place(part.owner), t, seen[t.at]) for t in part.terms]
         costs = []
         rows = []
@@ -196,7 +191,7 @@ class Formulator:
                 costs.append((spans.get(t.at, 1.0), y))
             else:
                 rows.append(y / t.scale)
-        return Formulas(local, data, self._vector, costs, rows)
+        return Formulas(variables[part.place], data, self._vector, costs, rows)
 
     def _point(self, phase: Phase, state, constants, s, refs) -> Point:
         """An instant of a phase, from scaled variables."""
@@ -213,9 +208,7 @@ class Formulator:
         return Point(q, v, a, None, z, duration, s, names, parameters, ref, view=phase.view)
 
     def _within(self, phase: Phase) -> tuple:
-        """Variables of a node and of a step, data, and what terms at each place see and span, of
-        one phase.
-        """
+        """Variables by place, data, and what terms at each place see and span, of one phase."""
         nx = len(phase.node_scales)
         constants = ca.SX.sym("const", len(phase.constant_scales))
         refs = ca.SX.sym("ref", sum(phase.references.values()))
@@ -235,13 +228,13 @@ class Formulator:
         seen |= {"mid": (mid,), "interval": (left, after, step)}
         # trapezoid rule: both ends count half
         inner = 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))
-        node = ca.vertcat(constants, state)
-        span = ca.vertcat(constants, state, jerk, right)
+        variables = dict.fromkeys(("node", "start", "end"), ca.vertcat(constants, state))
+        variables["interval"] = ca.vertcat(constants, state, jerk, right)
         data = ca.vertcat(s, refs, share)
-        return node, span, data, seen, {"node": step * inner, "mid": step}
+        return variables, data, seen, {"node": step * inner, "mid": step}
 
     def _ends(self) -> tuple:
-        """Variables of both ends of all phases, and what terms that join phases see."""
+        """The same of both ends of all phases, for terms that join them."""
         ends = {}
         symbols = []
         for name, phase in self._phases.items():
@@ -253,7 +246,7 @@ class Formulator:
             )
             ends[name] = SimpleNamespace(start=start, end=end)
             symbols += [constants, *states]
-        return ca.vertcat(*symbols), {"problem": (ends,)}
+        return {"problem": ca.vertcat(*symbols)}, ca.SX(0, 1), {"problem": (ends,)}, {}
 
 
 def _column(place: str, term: Term, seen: Sequence) -> ca.SX:
@@ -292,5 +285,6 @@ def chain_term(phase: Phase) -> Term:
         which = [phase.coordinates.index(name) for name in phase.integrated]
         return ca.vertcat(rate[which], place[which])
 
-    words = "state equation, Sec. III-A, V-A", "scaled", "interval"
-    return Term(JERK_CHAIN, *words, missed, identity=True)
+    return Term(
+        JERK_CHAIN, "state equation, Sec. III-A, V-A", "scaled", "interval", missed, identity=True
+    )

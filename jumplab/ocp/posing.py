@@ -15,7 +15,6 @@ import numpy as np
 from jumplab.errors import InputError, quoted
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.layout import PhaseLayout
-from jumplab.ocp.problem import Bound
 from jumplab.ocp.solution import Multipliers, PhaseGuess, PhaseSolution, resampled
 
 WHERE = {"all": slice(None), "start": slice(1), "inner": slice(1, None), "end": slice(-1, None)}
@@ -157,27 +156,21 @@ def variable_bounds(a: Assembled, parameters: Any) -> tuple[np.ndarray, np.ndarr
             low[i] = _resolve(lower, parameters, 1)[0] / size
             high[i] = _resolve(upper, parameters, 1)[0] / size
         for bound in phase.bounds:
-            _tighten(layout, bound, parameters, low, high)
+            index = layout.of(bound.on)[WHERE[bound.where]]
+            scale = phase.scale(bound.on)
+            least, most = (_resolve(x, parameters, len(scale)) for x in (bound.lower, bound.upper))
+            low[index] = np.maximum(low[index], least / scale)
+            high[index] = np.minimum(high[index], most / scale)
+            gap = low[index] - high[index]
+            if np.any(gap > 0):
+                k, i = np.unravel_index(np.argmax(gap), gap.shape)
+                node = range(len(layout.of(bound.on)))[WHERE[bound.where]][k]
+                raise InputError(
+                    f"bound {bound.name!r} of phase {phase.name!r} and another on {bound.on!r} "
+                    f"exclude each other at node {node}, component {i}: {low[index[k, i]]:.4g} > "
+                    f"{high[index[k, i]]:.4g} (scaled); check the bounds that depend on the target"
+                )
     return low, high
-
-
-def _tighten(
-    layout: PhaseLayout, bound: Bound, parameters: Any, low: np.ndarray, high: np.ndarray
-) -> None:
-    """Apply one bound to the vectors ``low`` and ``high``."""
-    index = layout.of(bound.on)[WHERE[bound.where]]
-    scale = layout.phase.scale(bound.on)
-    low[index] = np.maximum(low[index], _resolve(bound.lower, parameters, len(scale)) / scale)
-    high[index] = np.minimum(high[index], _resolve(bound.upper, parameters, len(scale)) / scale)
-    gap = low[index] - high[index]
-    if np.any(gap > 0):
-        k, i = np.unravel_index(np.argmax(gap), gap.shape)
-        node = range(len(layout.of(bound.on)))[WHERE[bound.where]][k]
-        raise InputError(
-            f"bound {bound.name!r} of phase {layout.phase.name!r} and another on {bound.on!r} "
-            f"exclude each other at node {node}, component {i}: {low[index[k, i]]:.4g} > "
-            f"{high[index[k, i]]:.4g} (scaled); check the bounds that depend on the target"
-        )
 
 
 # variables ----------------------------------------------------------------------------------------

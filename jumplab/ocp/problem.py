@@ -151,6 +151,20 @@ class Term:
         return self.weight is not None
 
 
+def limit(
+    name: str,
+    equation: str,
+    unit: str,
+    at: str,
+    of: Callable | str,
+    low: object = 0.0,
+    high: object = np.inf,
+    **more: Any,
+) -> Term:
+    """A constraint low <= of <= high; arguments otherwise as attributes of :class:`Term`."""
+    return Term(name, equation, unit, at, of, lower=low, upper=high, **more)
+
+
 @dataclass(frozen=True)
 class Bound:
     """A box on the variables of a phase.

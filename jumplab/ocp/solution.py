@@ -4,10 +4,11 @@ statistics.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 
 from jumplab.errors import Shown
 from jumplab.ocp.problem import Problem
@@ -15,31 +16,28 @@ from jumplab.ocp.problem import Problem
 
 def resampled(old: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarray:
     """Columns of ``values`` (K, C) given at ``old`` (K,), by straight lines at ``new``."""
-    if len(old) == len(new):
+    if np.array_equal(old, new):
         return values
     return np.array([np.interp(new, old, column) for column in values.T]).reshape(-1, len(new)).T
 
 
-def quintic(
-    ends: list[tuple[np.ndarray, np.ndarray]], step: float, h: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    """(q, v, a) of the polynomials of fifth degree through q, v, a at both ``ends`` of a step,
-    ``h`` after its start.
+# a polynomial's coefficients of the powers of u, from itself at u = 0 and 1, then its first
+# derivatives, then its second ones
+_FROM_ENDS = np.linalg.inv(
+    [polyval(u, polyder(np.eye(6), k)) for k in range(3) for u in (0.0, 1.0)]
+)
 
-    ``ends`` are (left, right) of q, v, a, each (n, nq); ``step`` [s]; ``h`` (n, 1) [s].
+
+def quintic(ends: Sequence[tuple], step: float, h: np.ndarray) -> np.ndarray:
+    """q, v, a (3, n, nq) of the polynomials of fifth degree through q, v, a at both ``ends`` of a
+    step, ``h`` after its start.
+
+    ``ends`` are (left, right) of q, v, a, numbers or (..., nq); ``step`` [s]; ``h`` (n, 1) [s].
     """
-    (q0, q1), (v0, v1), (a0, a1) = ends
-    u = h / step
-    missing = q1 - q0 - step * v0 - step**2 * a0 / 2
-    rate = step * (v1 - v0) - step**2 * a0
-    bend = step**2 * (a1 - a0)
-    c3 = 10 * missing - 4 * rate + bend / 2
-    c4 = -15 * missing + 7 * rate - bend
-    c5 = 6 * missing - 3 * rate + bend / 2
-    q = q0 + h * v0 + h**2 * a0 / 2 + u**3 * (c3 + u * (c4 + u * c5))
-    v = v0 + h * a0 + u**2 * (3 * c3 + u * (4 * c4 + u * 5 * c5)) / step
-    a = a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5)) / step**2
-    return q, v, a
+    sides = [x * step**k for k, pair in enumerate(ends) for x in pair]
+    powers = np.tensordot(_FROM_ENDS, sides, 1)
+    levels = [polyval(h / step, polyder(powers, k), tensor=False) / step**k for k in range(3)]
+    return np.array(levels)
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,8 +65,8 @@ class PhaseSolution(Shown):
     duration: float  # [s]
     constants: dict  # the phase's further ones
 
-    def sample(self, t: float | np.ndarray) -> tuple[np.ndarray, ...]:
-        """(q, v, a), each (n, nq), at times ``t`` (n,) [s] since the phase began.
+    def sample(self, t: float | np.ndarray) -> np.ndarray:
+        """q, v, a (3, n, nq) at times ``t`` (n,) [s] since the phase began.
 
         Polynomials of fifth degree through q, v, a of both neighbouring nodes: where the jerk is
         constant in between, they are the very motion that was optimised.

@@ -70,6 +70,16 @@ class Anchor:
     joint: int
     placement: pin.SE3
 
+    def place(self, data: pin.Data) -> pin.SE3:
+        """Placement in the world, in the state that ``data`` is in."""
+        return data.oMi[self.joint] * self.placement
+
+    def slope(
+        self, model: pin.Model, data: pin.Data, axes: pin.ReferenceFrame = WORLD
+    ) -> np.ndarray:
+        """Jacobian (6, nv) of its twist, in some ``axes``, in the state that ``data`` is in."""
+        return pin.getFrameJacobian(model, data, self.joint, self.placement, axes)
+
 
 def on_feet(robot: Robot, point: np.ndarray) -> list[Anchor]:
     """A ``point`` (3,) of the foot links' frames [m], of the left and of the right foot."""
@@ -108,8 +118,8 @@ def moving(model: pin.Model, data: pin.Data, q: np.ndarray, v: np.ndarray) -> No
 def point_motion(model: pin.Model, data: pin.Data, anchor: Anchor) -> PointMotion:
     """Motion of an anchor [m, rad, s] in the state that ``data`` is :func:`moving` in."""
     at = anchor.joint, anchor.placement
-    place = data.oMi[anchor.joint] * anchor.placement
-    jacobian = pin.getFrameJacobian(model, data, *at, WORLD)
+    place = anchor.place(data)
+    jacobian = anchor.slope(model, data)
     velocity = pin.getFrameVelocity(model, data, *at, WORLD).vector
     drift = pin.getFrameClassicalAcceleration(model, data, *at, WORLD).vector
     return PointMotion(place.translation, place.rotation, velocity, jacobian, drift)

@@ -152,11 +152,11 @@ def bring_feet(
     q = q.copy()
     for left in range(steps, -1, -1):
         pin.computeJointJacobians(model, data, q)
-        places = {a: data.oMi[a.joint] * a.placement for a in goals}
-        ways = np.array([pin.log6(places[a].actInv(goal)).vector for a, goal in goals.items()])
+        missed = [a.place(data).actInv(goal) for a, goal in goals.items()]
+        ways = np.array([pin.log6(x).vector for x in missed])
         if not left or np.abs(ways).max() < near:
             break
-        rows = [pin.getFrameJacobian(model, data, a.joint, a.placement, LOCAL) for a in goals]
+        rows = [a.slope(model, data, LOCAL) for a in goals]
         step = least_motion(np.concatenate(rows), ways.ravel(), give, damping)
         q = pin.integrate(model, q, np.clip(step, -most_rad, most_rad))
         if limits is not None:

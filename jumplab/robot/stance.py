@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot.contact import WORLD, on_feet
+from jumplab.robot.contact import on_feet
 from jumplab.robot.files import LEG
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, TO_COMPLEX, in_xz
 
@@ -161,8 +161,7 @@ def leg_length(robot: Robot) -> float:
     pin.forwardKinematics(model, data, stance_configuration(robot))
     hip = data.oMi[model.getJointId(robot.joints["hip_pitch"][0])]
     foot, _ = on_feet(robot, robot.foot.center)
-    sole = data.oMi[foot.joint] * foot.placement
-    return float(hip.translation[2] - sole.translation[2])
+    return float(hip.translation[2] - foot.place(data).translation[2])
 
 
 # robots that need space
@@ -222,7 +221,7 @@ def standing(robot: Robot) -> np.ndarray:
 
     def soles(q: np.ndarray) -> list[pin.SE3]:
         pin.forwardKinematics(model, data, q)
-        return [data.oMi[foot.joint] * foot.placement for foot in feet]
+        return [foot.place(data) for foot in feet]
 
     q = pin.neutral(model)
     first = np.array([sole.translation for sole in soles(q)])
@@ -278,7 +277,7 @@ def holding(robot: Robot, q: np.ndarray, friction: float) -> tuple[float, str, f
     level = friction / np.sqrt(2)
     edges = np.array([[x, y, 1.0] for x in (-level, level) for y in (-level, level)])
     anchors = [on_feet(robot, corner)[side] for side in (0, 1) for corner in robot.foot.corners]
-    slopes = [pin.getFrameJacobian(model, data, a.joint, a.placement, WORLD)[:3] for a in anchors]
+    slopes = [anchor.slope(model, data)[:3] for anchor in anchors]
     pushed = np.concatenate([edges @ slope for slope in slopes]).T
     effort = robot.limits.effort
     cost = np.append(np.zeros(pushed.shape[1]), 1.0)

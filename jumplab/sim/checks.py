@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.control.kinematics import Gauge, rotation
-from jumplab.robot.contact import WORLD, on_feet
+from jumplab.robot.contact import on_feet
 from jumplab.robot.description import Foot
 from jumplab.robot.legs import size
 from jumplab.sim import CONTACTS, STEP_S
@@ -112,7 +112,7 @@ def _kick(result: SimulationResult, row: int) -> np.ndarray:
     kick = np.zeros(model.nv)
     feet = on_feet(robot, np.zeros(3))
     for foot, wrench in zip(feet, result.foot_wrench[row], strict=True):
-        slope = pin.getFrameJacobian(model, data, foot.joint, foot.placement, WORLD)
+        slope = foot.slope(model, data)
         places = np.tile(wrench, (3, 1))
         places[1:, 4] = -np.array([robot.foot.heel, robot.foot.toe]) * wrench[2]
         kick += np.abs(np.linalg.solve(mass, STEP_S * slope.T @ places.T)).max(axis=1)
@@ -154,7 +154,7 @@ def unexplained(result: SimulationResult) -> tuple[np.ndarray, np.ndarray]:
         pin.computeJointJacobians(model, data, q)
         for at, wrench in zip(feet, result.foot_wrench[k], strict=True):
             if wrench.any():
-                slope = pin.getFrameJacobian(model, data, at.joint, at.placement, WORLD)
+                slope = at.slope(model, data)
                 left[k] -= slope.T @ wrench
         if pushes[k].any():
             force = rotation(q[3:7]).T @ pushes[k]

@@ -117,12 +117,10 @@ def sorted_out(
         own[phase] = (*own.get(phase, ()), *extra)
         for term in own[phase]:
             require_type(term, Term, f"an own term of {name!r}")
-    for name, value in weights.items():
-        stage, rest = _stage_of(name)
-        by_stage[stage][1][rest] = value
-    for name in off:
-        stage, rest = _stage_of(name)
-        by_stage[stage][2][rest] = None
+    for kind, names in enumerate((weights, dict.fromkeys(off)), 1):
+        for name, value in names.items():
+            stage, rest = _stage_of(name)
+            by_stage[stage][kind][rest] = value
     return {x: StageChanges(own, new, tuple(gone)) for x, (own, new, gone) in by_stage.items()}
 
 

@@ -20,6 +20,7 @@ from jumplab.io.columns import Rows
 from jumplab.models.full import FullBody
 from jumplab.ocp import Problem, Term
 from jumplab.ocp.cache import in_turn
+from jumplab.ocp.solution import resampled
 from jumplab.robot import Robot
 from jumplab.robot.legs import size
 from jumplab.robot.reach import rod_of
@@ -496,5 +497,5 @@ def motion_of_joints(joints: JointPlan, planner: WholeBodyPlanner, toe_s: float)
     charts = planner.body.model.of_pinocchio(joints.q)
     takeoff = float(joints.t[int(np.argmax(joints.phase == "flight"))])
     times = planner.mesh.nodes(takeoff - toe_s, takeoff, float(joints.t[-1])).values()
-    rows = [np.stack([np.interp(t, joints.t, x) for x in charts.T], -1) for t in times]
+    rows = [resampled(joints.t, charts, t) for t in times]
     return Motion(np.array([np.ptp(t) for t in times]), rows)

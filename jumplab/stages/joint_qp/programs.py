@@ -11,6 +11,7 @@ import pinocchio as pin
 from jumplab.models.full import FullBody, FullTerms
 from jumplab.ocp import Phase
 from jumplab.ocp.qp import Qp
+from jumplab.ocp.solution import quintic
 from jumplab.robot import SAGITTAL_JOINTS
 from jumplab.stages.joint_qp.point import StepPoint
 from jumplab.stages.joint_qp.settings import Gain, Options
@@ -49,14 +50,12 @@ class Track:
         SRMP's pivot stays on the ground while the robot's heel may be up at take-off, so the two
         can meet only in the air.
         """
-        from scipy.interpolate import BPoly  # slow to import
-
-        start = np.asarray(value) - self.value[0], np.asarray(rate) - self.rate[0]
-        zero = np.zeros_like(start[0])
+        none = np.zeros_like(value)
+        ends = [(value - self.value[0], none), (rate - self.rate[0], none), (none, none)]
         end = min(blend_s, self.t[-1])
-        fade = BPoly.from_derivatives([0.0, end], [[*start, zero], [zero] * 3])
-        t = np.minimum(self.t, end)
-        return Track(self.t, self.value + fade(t), self.rate + fade.derivative()(t))
+        since = np.minimum(self.t, end).reshape(-1, *[1] * none.ndim)
+        offset, drift, _ = quintic(ends, end, since)
+        return Track(self.t, self.value + offset, self.rate + drift)
 
 
 def in_space(x: np.ndarray) -> np.ndarray:
@@ -111,8 +110,7 @@ class PhaseQp:
             if np.array_equal(low, high):
                 qp.equality(term.name, rows.matrix, low - rows.offset, rows.labels)
             else:
-                sides = low - rows.offset, high - rows.offset
-                qp.limit(term.name, rows.matrix, *sides, rows.labels)
+                qp.limit(term.name, rows.matrix, low - rows.offset, high - rows.offset, rows.labels)
         return qp
 
     def joint_range(
@@ -294,22 +292,20 @@ class FlightQp(PhaseQp):
             base_force=self._drift(k, now),
         )
         if self.t[k] <= self.t[-1] / 2:  # coming down, the surface is the landing's business
-            height = np.stack([now.tip.place[:, 2], now.heel.place[:, 2]], 1).ravel()
-            speed = np.stack([now.tip.velocity[:, 2], now.heel.velocity[:, 2]], 1).ravel()
-            target.floor = self._floor(height - self.ground, speed)
+            height = now.vertical("place") - self.ground
+            target.floor = self._floor(height, now.vertical("velocity"))
         return target
 
     def _drift(self, k: int, now: FullTerms) -> np.ndarray:
         """Force on the base that pulls CoM and momentum back to their ballistic values: what
         integration lost.
         """
-        mass = self.body.mass
         t = self.t[k]
         gain = self.options.gains.momentum_drift
         fall = np.array([0.0, 0.0, -self.body.gravity])
         velocity = self.start.com_velocity
         place_error = now.com - (self.start.com + velocity * t + fall * t * t / 2)
-        force = mass * gain.back(place_error, now.com_velocity - (velocity + fall * t))
+        force = self.body.mass * gain.back(place_error, now.com_velocity - (velocity + fall * t))
         moment = -gain.damping * (now.momentum[3:] - self.start.momentum[3:])
         turn = now.base_rotation.T
         arm = now.com - now.q[:3]

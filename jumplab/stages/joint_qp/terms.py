@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InputError, quoted
+from jumplab.errors import InputError
 from jumplab.models.full import SIDES, FullBody, force_target
 from jumplab.ocp import Phase, Problem, Term
-from jumplab.ocp.changes import ends
+from jumplab.ocp.changes import check_weight, ends
+from jumplab.ocp.problem import limit
 from jumplab.robot.contact import wrench_rows
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.joint_qp.point import Affine, StepPoint
@@ -64,13 +64,11 @@ def _shared_terms(phase: str, weights: Any, limits: Limits) -> list[Term]:
         return p.target.acceleration_range
 
     def between(name, equation, unit, of, ends):
-        sides = dict(lower=lambda p: ends(p)[0], upper=lambda p: ends(p)[1])
-        return Term(name, equation, unit, "node", of, **sides)
+        return limit(name, equation, unit, "node", of, lambda p: ends(p)[0], lambda p: ends(p)[1])
 
     posture = "ours: towards the posture"
     regular = "ours: regulariser", "m/s^2, rad/s^2", "node", "accelerations"
     dynamics = "Sec. IV: base rows, M theta'' + H = J^T F"
-    line = "ours: torque, less above the corner speed"
     stops = "ours: speed and stops after the step"
     return [
         Term("joints", posture, "rad/s^2", "node", joints, weights.posture),
@@ -78,7 +76,7 @@ def _shared_terms(phase: str, weights: Any, limits: Limits) -> list[Term]:
         Term("acceleration", *regular, weights.acceleration),
         Term("base dynamics", dynamics, "N, N m", "node", base, identity=True),
         Term("symmetry", "Sec. IV: S theta'' = 0", "rad/s^2", "node", mirrored),
-        between("torque", line, "N m", torque, torque_range),
+        between("torque", "ours: torque, less above the corner speed", "N m", torque, torque_range),
         between("speed and range", stops, "rad/s^2", accelerations, joint_range),
     ]
 
@@ -96,8 +94,9 @@ def launch_terms(o: Options) -> list[Term]:
 
     def missing(p):
         """A_f F - B_f (6 rows)."""
-        asked = p.target.com_acceleration, p.target.momentum_rate
-        return p.quantities.A_f @ p.wrench - force_target(p.body.mass, p.body.gravity, *asked)
+        return p.quantities.A_f @ p.wrench - force_target(
+            p.body.mass, p.body.gravity, p.target.com_acceleration, p.target.momentum_rate
+        )
 
     def force(p):
         return forwards(p, w.force_x, w.force) * missing(p)[:3]
@@ -155,13 +154,11 @@ def contact_terms(o: Options) -> list[Term]:
 
     foot = "Sec. IV-A: J theta'' + drift = p''_foot"
     flat = "ours: flat foot, or no moment about the toe"
-    push = "ours: F_z >= 0, friction, CoP in the sole"
-    above = "Sec. IV-A: heel above the ground"
     return [
         Term("tiptoe", foot, "m/s^2, rad/s^2", "node", tiptoe),
         Term("foot pitch or toe moment", flat, "rad/s^2, N m", "node", pitch),
-        Term("ground", push, "N, N m", "node", ground, upper=np.inf),
-        Term("heel", above, "m/s^2", "node", heel, lower=least, upper=np.inf),
+        limit("ground", "ours: F_z >= 0, friction, CoP in the sole", "N, N m", "node", ground),
+        limit("heel", "Sec. IV-A: heel above the ground", "m/s^2", "node", heel, least),
     ]
 
 
@@ -181,19 +178,16 @@ def flight_terms(o: Options) -> list[Term]:
         return p.inertia_acceleration - p.target.inertia_accel
 
     def ground(p):
-        ends = p.quantities.tip, p.quantities.heel
-        vertical = np.stack([x.jacobian[:, 2] for x in ends], 1).reshape(4, -1)
-        drift = np.stack([x.drift[:, 2] for x in ends], 1).ravel()
-        return p.affine(vertical, drift).named(_both(["toe", "heel"]))
+        x = p.quantities
+        rows = p.affine(x.vertical("jacobian"), x.vertical("drift"))
+        return rows.named(_both(["toe", "heel"]))
 
     def least(p):
         return p.target.floor
 
-    follow = "Sec. IV-B: J_rd theta'' + drift - p''_rd"
     shape = "Sec. IV-B: J_rho theta'' + drift - rho''_ref"
-    above = "ours: toe and heel above the ground"
     return [
-        Term("foot", follow, "m/s^2", "node", foot, w.foot),
+        Term("foot", "Sec. IV-B: J_rd theta'' + drift - p''_rd", "m/s^2", "node", foot, w.foot),
         Term(
             "foot level",
             "ours: sole parallel to the ground",
@@ -203,7 +197,7 @@ def flight_terms(o: Options) -> list[Term]:
             w.foot_level,
         ),
         Term("inertia", shape, "kg m^2/s^2", "node", inertia, w.inertia),
-        Term("ground", above, "m/s^2", "node", ground, lower=least, upper=np.inf),
+        limit("ground", "ours: toe and heel above the ground", "m/s^2", "node", ground, least),
         *_shared_terms("flight", w, o.limits),
     ]
 
@@ -243,11 +237,7 @@ def changed_problem(
     problem = replace(changes, weights={}, off=()).applied(build_problem(options), look)
     weights = {}
     for name, factor in changes.weights.items():
-        if isinstance(factor, bool) or not isinstance(factor, Real) or not 0 <= factor < np.inf:
-            raise InputError(
-                f"weight {name!r} of 'joint qp' = {quoted(factor)}: "
-                f"its factor must be a number of 0 or more"
-            )
+        check_weight(f"weight {name!r} of 'joint qp'", factor, "its factor")
         weights |= {"/".join(cost): factor * usual for cost, usual in problem.costs(name).items()}
     return replace(changes, terms={}, weights=weights).applied(problem)
 

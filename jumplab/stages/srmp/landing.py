@@ -20,12 +20,12 @@ from jumplab.models.full import FullBody, FullTerms
 from jumplab.models.srmp import COORDINATES
 from jumplab.ocp import Nlp, PhaseGuess, Statistics
 from jumplab.ocp.cache import in_turn
-from jumplab.ocp.problem import Bound, Phase, Problem, Term
+from jumplab.ocp.problem import Bound, Phase, Problem, Term, limit
 from jumplab.robot import Robot
 from jumplab.robot.reach import FORCE_SHARE, Reach, reach
 from jumplab.stages.srmp.planner import SrmpStance, grid, on_ground
-from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, limit, rod_at
-from jumplab.stages.srmp.settings import SrmpSettings
+from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, rod_at
+from jumplab.stages.srmp.settings import Range, SrmpSettings
 
 # touchdown
 # ------------------------------------------------------------------------------------------
@@ -76,8 +76,8 @@ class LandingSettings:
     """Weights and bounds of the landing; the paper prints none of these numbers."""
 
     intervals: int = 32  # steps of about 30 ms; twice as many move the CoM by less than 5 mm
-    duration_s: tuple[float, float] = (0.5, 1.2)  # from a quick knee bend to a slow one
-    lean_rad: tuple[float, float] = (-0.8, 0.8)  # box on theta_l
+    duration_s: Range = (0.5, 1.2)  # from a quick knee bend to a slow one
+    lean_rad: Range = (-0.8, 0.8)  # box on theta_l
     cop_margin_m: float = 0.018  # inside the sole's edges: what the landing controller itself keeps
     # of the weight, least vertical force: soles that are hardly loaded slip and tip
     press_share: float = 0.7
@@ -163,25 +163,22 @@ def landing_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term
         return p.L - p.p.L
 
     heel, toe = envelope.cop
-    soft = "ours: a soft catch"
-    middle = "ours, times F_z / m g"
-    joints = "ours: from the joint speeds"
     unit = "kg m^2/s"
     return [
         *(replace(t, **changes[t.name]) for t in shared),
         *cop_terms(mass, heel + s.cop_margin_m, toe - s.cop_margin_m),
         Term(
             "CoM acceleration",
-            soft,
+            "ours: a soft catch",
             "m/s^2",
             "node",
             "com_acceleration",
             s.w_acceleration,
         ),
-        Term("CoP from the middle", middle, "m", "node", cop, s.w_cop),
+        Term("CoP from the middle", "ours, times F_z / m g", "m", "node", cop, s.w_cop),
         Term("trunk upright", "ours", "rad", "node", lean, s.w_posture),
         Term("landing time", "ours", "s", "end", "duration", s.w_time),
-        limit("leg speed", joints, "m/s", "node", room, 0.0, skip=(1, 0)),
+        limit("leg speed", "ours: from the joint speeds", "m/s", "node", room, skip=(1, 0)),
         Term("L at touchdown", "after the impact", unit, "start", touched, scale=10.0),
         Term("L at rest", "standing", unit, "end", "L", scale=10.0),
     ]
@@ -200,14 +197,12 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
     def rates(sign):
         return lambda parameters: np.array([*parameters["rates"], sign * free, sign * free])
 
-    boxes = settings.lean_rad, envelope.length, base.turn_rad, base.radius_m
-    low, high = zip(*boxes, strict=True)
+    low, high = zip(settings.lean_rad, envelope.length, base.turn_rad, base.radius_m, strict=True)
     first, last = ([0.0, envelope.start[1], turn, envelope.start[3]] for turn in (-free, free))
     still = np.array([0.0, 0.0, free, 0.0])  # turning is what L at rest stops
-    impact = "after the impact"
     bounds = (
         Bound("touchdown", "flight's end", "rad, m", "q", start, start, "start"),
-        Bound("touchdown rates", impact, "1/s", "v", rates(-1), rates(1), "start"),
+        Bound("touchdown rates", "after the impact", "1/s", "v", rates(-1), rates(1), "start"),
         Bound("state box", "SL-B1", "rad, m", "q", low, high, "inner"),
         Bound("stance", "standing", "rad, m", "q", first, last, "end"),
         Bound("at rest", "standing", "1/s", "v", -still, still, "end"),

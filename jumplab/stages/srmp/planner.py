@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
@@ -18,6 +19,7 @@ from jumplab.ocp.nlp import WARM
 from jumplab.ocp.solution import quintic
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
+from jumplab.robot.sagittal import in_xz
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import build_problem
 from jumplab.stages.srmp.settings import SrmpSettings
@@ -151,11 +153,12 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
         return PhaseGuess(duration, q, 0 * q, 0 * q)
 
     theta = lean + spin * flight_s * np.linspace(0.0, 1.0, n + 1)[:, None]
-    inertia = np.full_like(theta, rho), 0 * theta, 0 * theta
     return {
         "flat": leaning(0.5, 0.0, 0.8, n_flat),
         "toe": leaning(0.12, 0.8, 1.0, n_toe),
-        "flight": PhaseGuess(flight_s, *inertia, theta, constants),
+        "flight": PhaseGuess(
+            flight_s, np.full_like(theta, rho), 0 * theta, 0 * theta, theta, constants
+        ),
     }
 
 
@@ -206,17 +209,10 @@ class SrmpPlanner:
         weights = self.changes.spread(self.nlp.problem, weights)
         if near is not None:
             known = near.solution
-            try:
-                solution = self._warm.solve(
-                    data,
-                    known.guess(),
-                    weights=weights,
-                    explain=False,
-                    multipliers=known.multipliers,
-                )
+            options = dict(weights=weights, multipliers=known.multipliers, explain=False)
+            with suppress(SolverError):  # as if there had been none
+                solution = self._warm.solve(data, known.guess(), **options)
                 return sample_plan(task, solution, self.reach)
-            except SolverError:
-                pass  # as if there had been none
         guess = naive_guess(task, self.reach, self.settings)
         return sample_plan(task, self.nlp.solve(data, guess, weights=weights), self.reach)
 
@@ -284,13 +280,11 @@ def _sample_flight(
     # only the ends of the leg's length matter, the rod has no mass
     ends = [(takeoff_length, c["leg"]), (0.0, 0.0), (0.0, 0.0)]
     leg, leg_rate, _ = quintic(ends, flight.duration, t)
-    along = -np.stack([np.sin(theta), np.cos(theta)], -1)
-    across = np.stack([along[:, 1], -along[:, 0]], -1)
-    length, speed, turning = (x[:, None] for x in (leg, leg_rate, c["L"] / rho))
+    way = -1j * np.exp(-1j * theta)  # from CoM to foot, x + iz
     fall = np.array([0.0, -gravity])
     velocity = np.array([c["vel_x"], c["vel_z"]])
     time = t[:, None]
     com = np.array([c["com_x"], c["com_z"]]) + velocity * time + fall * time**2 / 2
     motion = com, velocity + fall * time, np.broadcast_to(fall, com.shape), np.full_like(t, c["L"])
-    foot = length * along, speed * along + length * turning * across
+    foot = in_xz(leg * way), in_xz((leg_rate - 1j * leg * c["L"] / rho) * way)
     return SrmpFlight(t, *motion, rho, rho_v, rho_a, theta, *foot)

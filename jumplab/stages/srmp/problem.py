@@ -5,14 +5,13 @@ flight, joined at take-off (Sec. III of the paper); pure, nothing here solves.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from jumplab.models.srmp import COORDINATES, SrmpFlightState, SrmpState
 from jumplab.ocp.derivatives import chain
-from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
+from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term, limit
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.stages.srmp.settings import SrmpSettings
@@ -29,13 +28,6 @@ SCALES = {
     "j": [1000.0, 500.0, 1000.0, 500.0],
 }
 FLIGHT_SCALES = {"q": 1.0, "v": 20.0, "a": 200.0, "j": 5000.0}
-
-
-def limit(
-    name: str, equation: str, unit: str, at: str, of: Any, low: Any, high: Any = np.inf, **more: Any
-) -> Term:
-    """A constraint low <= of <= high."""
-    return Term(name, equation, unit, at, of, lower=low, upper=high, **more)
 
 
 def rod_at(mass: float, p: Point) -> SrmpState:
@@ -55,7 +47,6 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     """Costs and constraints all along the launch, SL-* (Sec. III-A)."""
     mg = mass * GRAVITY
     roots = ca.DM(np.sqrt(s.w_jerk))
-    shape = "SL-P4, SL-E5; ours: rho(phi)"
 
     def inertia_room(p):
         low, high = (
@@ -78,10 +69,10 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         Term("L rate", "SL-J3", "N m", "node", "L_rate", s.w_momentum_rate),
         Term("turn", "SL-J4", "rad", "node", lambda p: p.q[2], s.w_turn),
         limit("trunk range", "SL-P1, as path", "rad", "node", "posture", *reach.posture),
-        limit("inertia envelope", shape, "kg m^2", "node", inertia_room, 0.0),
+        limit("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_room),
         limit("L range", "SL-P5", "kg m^2/s", "node", "L", *s.momentum, scale=10.0),
-        limit("unilateral", "ours", "N", "node", push, 0.0, scale=mg, skip=(0, 1)),
-        limit("friction", "ours", "N", "node", cone, 0.0, scale=mg, skip=(0, 1)),
+        limit("unilateral", "ours", "N", "node", push, scale=mg, skip=(0, 1)),
+        limit("friction", "ours", "N", "node", cone, scale=mg, skip=(0, 1)),
         *leg_terms(mass, reach, s),
     ]
 
@@ -103,10 +94,9 @@ def leg_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         return s.speed_share * ca.polyval(ca.DM(reach.speed_fit), p.q[1]) - p.v[1]
 
     torques = "SL-B1 on F; ours: from the joint torques"
-    speeds = "SL-B1; ours: from the joint speeds"
     return [
-        limit("leg force", torques, "N", "node", strength, 0.0, scale=mass * GRAVITY),
-        limit("leg speed", speeds, "m/s", "node", extension, 0.0),
+        limit("leg force", torques, "N", "node", strength, scale=mass * GRAVITY),
+        limit("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension),
     ]
 
 
@@ -139,8 +129,8 @@ def reach_terms(reach: Reach, s: SrmpSettings, heel_up: bool) -> list[Term]:
     low = "ours: flat feet"
     flat = [
         Term("crouch depth", low, "m", "node", deep, s.w_deep_crouch),
-        limit("CoM not too low", low, "m", "node", height, 0.0, scale=0.1),
-        limit("CoM not too low (between)", low, "m", "interval", between, 0.0, scale=0.1),
+        limit("CoM not too low", low, "m", "node", height, scale=0.1),
+        limit("CoM not too low (between)", low, "m", "interval", between, scale=0.1),
     ]
     return [usual] if heel_up else [usual, *flat]
 
@@ -157,8 +147,8 @@ def cop_terms(mass: float, low: float, high: float, slack: float = 0.0) -> list[
 
     scale = 0.1 * mass * GRAVITY
     return [
-        limit("CoP", "SL-P2, times F_z", "N m", "node", room, 0.0, scale=scale, skip=(0, 1)),
-        limit("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, 0.0, scale=scale),
+        limit("CoP", "SL-P2, times F_z", "N m", "node", room, scale=scale, skip=(0, 1)),
+        limit("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, scale=scale),
     ]
 
 
@@ -210,19 +200,18 @@ def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
 
     rate = s.touchdown_inertia_rate
     lean = s.touchdown_lean
-    still = "inertia rate at touchdown"
     below = "ours: foot below the CoM"
-    falling = "ours: not on the way up"
-    inertia = "inertia at touchdown", "ours: rho(phi)", "kg m^2", "end"
-    usual = limit(*inertia, unusual, *s.touchdown_inertia)
+    usual = limit(
+        "inertia at touchdown", "ours: rho(phi)", "kg m^2", "end", unusual, *s.touchdown_inertia
+    )
     return [
         *([] if reach is None else [usual]),
         Term("inertia acceleration", "SF-J1", "kg m^2/s^2", "node", "a", s.w_inertia_accel),
         Term("inertia jerk", "SF-J1", "kg m^2/s^3", "mid", "j", s.w_inertia_jerk),
         Term("rotation", "SF-D1", "rad", "interval", rotation, identity=True),
-        limit(still, "ours", "kg m^2/s", "end", "v", -rate, rate, scale=10.0),
+        limit("inertia rate at touchdown", "ours", "kg m^2/s", "end", "v", -rate, rate, scale=10.0),
         Term("touchdown height", "ours: t_f from both CoM heights", "m", "end", height),
-        limit("falling at touchdown", falling, "m/s", "end", climb, -np.inf, 0.0),
+        limit("falling at touchdown", "ours: not on the way up", "m/s", "end", climb, -np.inf, 0.0),
         limit("lean at touchdown", below, "rad", "end", _foot_angle, -lean, lean),
     ]
 
@@ -290,11 +279,10 @@ def landing_terms(s: SrmpSettings) -> list[Term]:
         end = e["flight"].end
         return _foot_ahead(end) - s.capture_offset_m - s.capture_slope_s * end.c.vel_x
 
-    window = s.capture_window_m
     instead = "ours; replaces SF-E1"  # about the pivot it lands too far ahead, and falls
     return [
         Term("jump length", "SL-E1, foot to foot", "m", "problem", length),
-        limit("capture window", instead, "m", "problem", capture, *window, scale=0.1),
+        limit("capture window", instead, "m", "problem", capture, *s.capture_window_m, scale=0.1),
     ]
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 from jumplab.task import FRICTION
 
+Range = tuple[float, float]  # lower, upper
+
 
 @dataclass(frozen=True)
 class SrmpSettings:
@@ -22,42 +24,42 @@ class SrmpSettings:
     # added there, where force and torque vanish together and their quotient bends
     toe_slack_n_m: float = 2.0
     # duration of the flat-foot part of the launch, as in stage 3
-    flat_s: tuple[float, float] = (0.25, 0.90)
+    flat_s: Range = (0.25, 0.90)
     # of its toe part (heel up); fixed, since the cost hardly feels it
-    toe_s: tuple[float, float] = (0.12, 0.12)
+    toe_s: Range = (0.12, 0.12)
     # trunk at take-off [rad]: leaning into the jump, so it bends first
-    posture_end: tuple[float, float] = (0.2, 0.8)
+    posture_end: Range = (0.2, 0.8)
     # of the extension speed: the foot's own rotation, not counted there, helps
     speed_share: float = 0.95
     # share of the extension speed up to which the full leg force is there
     corner_speed: float = 0.5
-    momentum: tuple[float, float] = (-45.0, 45.0)  # box on L [kg m^2/s]: a backflip needs about -35
+    momentum: Range = (-45.0, 45.0)  # box on L [kg m^2/s]: a backflip needs about -35
     inertia_margin: float = 0.05  # share of the envelope's width kept free on either side
     flight_inertia: float = (
         # share of its width up to which a flight goes: more takes straight legs and raised arms
         0.76
     )
-    takeoff_lean: tuple[float, float] = (-0.5, 0.7)  # [rad]
+    takeoff_lean: Range = (-0.5, 0.7)  # [rad]
     # share of the standing phi at most: knees still bent, far from the straight leg
     takeoff_length: float = 0.95
     # box on d rho/dt [kg m^2/s]: all limbs at half of their speed limits
     inertia_rate: float = 40.0
     inertia_accel: float = 600.0  # box on d^2 rho/dt^2 [kg m^2/s^2]
-    turn_rad: tuple[float, float] = (-2.5, 2.5)  # box on theta_pl
-    radius_m: tuple[float, float] = (0.1, 1.0)  # box on varphi
-    com_m: tuple[float, float] = (-1.5, 2.5)  # box on the CoM at take-off, seen from the pivot
-    speed_m_s: tuple[float, float] = (-6.0, 6.0)  # box on its velocity: a CoM rise of 1.8 m
+    turn_rad: Range = (-2.5, 2.5)  # box on theta_pl
+    radius_m: Range = (0.1, 1.0)  # box on varphi
+    com_m: Range = (-1.5, 2.5)  # box on the CoM at take-off, seen from the pivot
+    speed_m_s: Range = (-6.0, 6.0)  # box on its velocity: a CoM rise of 1.8 m
     touchdown_inertia_rate: float = 8.0  # [kg m^2/s] the limbs come nearly to rest before touchdown
     touchdown_lean: float = 1.0  # [rad] at most, either way; without it a plan may land on its head
     # share of the standing phi: knees bent by about 0.7 rad
-    touchdown_length: tuple[float, float] = (0.92, 0.97)
+    touchdown_length: Range = (0.92, 0.97)
     touchdown_fold_per_m: float = 0.35  # lower share per metre of platform: legs folded to reach it
     # sole centre ahead of the CoM at touchdown, offset + slope v_x, as in stage 3
     capture_offset_m: float = 0.02
     capture_slope_s: float = 0.13
-    capture_window_m: tuple[float, float] = (-0.03, 0.02)
+    capture_window_m: Range = (-0.03, 0.02)
     # [kg m^2] around the usual inertia at the touchdown length
-    touchdown_inertia: tuple[float, float] = (-0.3, 0.5)
+    touchdown_inertia: Range = (-0.3, 0.5)
     # the positive part of a crouch's depth is rounded over this much
     crouch_smoothing_m: float = 0.02
     # SL-J1: of the jerks of theta_l, phi, theta_pl, varphi, each in its usual size

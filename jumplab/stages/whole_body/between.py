@@ -71,13 +71,12 @@ def _pressed_outside(tape: Tape, robot: Robot, turn: np.ndarray) -> np.ndarray:
     least = size(robot).of(PRESSED_N, "N")
     load = np.where(force[..., 2] > least, force[..., 2], np.nan)
     moment = tape.f[..., 3:] - np.cross(turn @ foot.tip, force)
-    x = -moment[..., 1] / load  # from the middle of the toe edge
-    y = moment[..., 0] / load
-    ahead = turn[..., :2, 0] / np.linalg.norm(turn[..., :2, 0], axis=-1, keepdims=True)
-    along = ahead[..., 0] * x + ahead[..., 1] * y
-    across = ahead[..., 0] * y - ahead[..., 1] * x
+    # x + iy, from the middle of the toe edge, in the axes of the foot's heading
+    ahead = turn[..., 0, 0] + 1j * turn[..., 1, 0]
+    cop = (1j * (moment[..., 0] / load) - moment[..., 1] / load) * np.abs(ahead) / ahead
     length = np.where(tape.contacts == FLAT, foot.toe - foot.heel, 0.0)
-    outside = np.max([along, -along - length, np.abs(across) - foot.half_width], axis=0)
+    beside = np.abs(cop.imag) - foot.half_width
+    outside = np.max([cop.real, -cop.real - length, beside], axis=0)
     return np.where(np.isnan(load), -np.inf, outside)
 
 

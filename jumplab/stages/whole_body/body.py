@@ -10,13 +10,13 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.models.spatial import SpatialModel
-from jumplab.robot import Robot
+from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.robot.contact import on_feet
 from jumplab.robot.legs import leg_columns
 from jumplab.robot.reduction import even_masses
 from jumplab.robot.stance import knees, leg_length, stance_configuration
 from jumplab.stages.whole_body.coordinates import BASE
-from jumplab.stages.whole_body.shapes import Box, boxes
+from jumplab.stages.whole_body.shapes import Box
 from jumplab.task import GRAVITY
 
 # of half the length of a shank's box, where a platform's edge may meet it
@@ -62,7 +62,7 @@ class Body:
         self.stance = self.model.of_pinocchio(configuration[None])[0]
         data = robot.model.createData()
         pin.forwardKinematics(robot.model, data, configuration)
-        self.places = np.array([(data.oMi[x.joint] * x.placement).translation for x in tips])
+        self.places = np.array([x.place(data).translation for x in tips])
         self.ankle_m = float(data.oMi[tips[0].joint].translation[2])
 
     def _on_feet(self, point: np.ndarray) -> list[np.ndarray]:
@@ -89,15 +89,12 @@ class Body:
         """Flexion of the knees to which the hips' stops let the robot squat: hips turn by half of
         what the knees do, from the stance.
         """
-        turned = self.stance[BASE:]
-        bent = min(sign * turned[k] + angle for k, sign, angle in self.knees)
+        bent = min(sign * self.stance[BASE + k] + angle for k, sign, angle in self.knees)
         rooms = []
-        for name, sign in zip(
-            self.robot.joints["hip_pitch"], self.robot.sagittal.signs[0], strict=True
-        ):
-            k = self.joint_names.index(name)
+        for column, sign in self.hips:
+            k = column - BASE
             stops = sign * self.motors.lower[k], sign * self.motors.upper[k]
-            rooms.append(sign * turned[k] - min(stops))
+            rooms.append(sign * self.stance[column] - min(stops))
         return float(bent + 2 * min(rooms))
 
     @cached_property
@@ -119,17 +116,20 @@ class Body:
         """Bodies from one up to the base (which is left out)."""
         return [joint - 1 for joint in self.robot.model.supports[body + 1] if joint > 1][::-1]
 
+    def _turning(self, joint: str) -> list[tuple[int, float]]:
+        """Column of the chart of a sagittal ``joint`` on each side, and its sign about +y."""
+        turning = [x for x in self.robot.role_signs() if SAGITTAL_JOINTS[x[1]] == joint]
+        return [(BASE + self.joint_names.index(name), sign) for name, _, sign in turning]
+
+    @cached_property
+    def hips(self) -> list[tuple[int, float]]:
+        """Columns of the chart of the hips' pitch, with the sign that makes backward positive."""
+        return self._turning("hip")
+
     @cached_property
     def shoulders(self) -> list[tuple[int, float]]:
-        """Columns of the chart of the joints that swing the arms, with the sign that makes backward
-        positive.
-        """
-        names = self.robot.joints["shoulder_pitch"]
-        signs = self.robot.sagittal.signs[3]
-        return [
-            (BASE + self.joint_names.index(name), float(sign))
-            for name, sign in zip(names, signs, strict=False)
-        ]
+        """The same of the joints that swing the arms, if there are any."""
+        return self._turning("shoulder")
 
     @cached_property
     def upper(self) -> list[int]:
@@ -183,8 +183,17 @@ class Body:
 
     @cached_property
     def shapes(self) -> list[Box]:
-        """Boxes around the collision shapes, in the same order."""
-        return boxes(self.geometry, self.model)
+        """Boxes around the collision shapes [m], in the same order."""
+        out = []
+        for shape in self.geometry.geometryObjects:
+            shape.geometry.computeLocalAABB()
+            low = shape.geometry.aabb_local.min_
+            high = shape.geometry.aabb_local.max_
+            body = shape.parentJoint - 1
+            centre = self.model.local(body + 1, shape.placement.act((low + high) / 2))
+            axes = self.model.bodies[body].own.T @ shape.placement.rotation
+            out.append(Box(shape.name, body, centre, axes, (high - low) / 2))
+        return out
 
     def _shapes_of(self, bodies: set[int]) -> list[tuple[Box, np.ndarray]]:
         """Boxes of some bodies, each with the way from its middle to its far end (3,) [m]."""

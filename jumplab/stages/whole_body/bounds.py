@@ -71,7 +71,6 @@ def _travel(body: Body, limits: Limits, task: JumpTask, along: np.ndarray) -> fl
     """The most by which the soles could come ``along`` (2,), a unit vector seen from above [m]."""
     reach, start = reach_and_start(body)
     g = task.gravity
-    friction = limits.friction
     edges = np.linspace(0.0, reach, CELLS + 1)
     # cells (weighings, z at take-off, z at touchdown): each with what of it is worst
     low = edges[:-1, None]
@@ -82,7 +81,7 @@ def _travel(body: Body, limits: Limits, task: JumpTask, along: np.ndarray) -> fl
     late = WEIGHINGS * push_s(limits) - 1
     held = (1 + late * np.abs(late)) / (2 * WEIGHINGS)
     up = task.takeoff_speed + WEIGHINGS * (2 * reach - low - start[2])
-    speed = friction * (up + g * held) + WEIGHINGS * (lean - start[:2] @ along)
+    speed = limits.friction * (up + g * held) + WEIGHINGS * (lean - start[:2] @ along)
     way = lean + speed * flight_s + np.sqrt(reach**2 - landing**2)
     turned = 2 * abs(math.sin(task.yaw_rad / 2)) * body.half_m
     return float(np.where(fall < 0, -np.inf, way).max(axis=(1, 2)).min()) + turned
@@ -104,15 +103,11 @@ def reach_and_start(body: Body) -> tuple[float, np.ndarray]:
         tree = body.robot.model
         tips = on_feet(body.robot, body.robot.foot.tip)
         sides = [_distances(tree, x.joint, x.placement.translation) for x in tips]
-        legs = [set(tree.supports[x.joint]) for x in tips]
-        share = [float(k in legs[0]) - float(k in legs[1]) for k in range(1, tree.njoints)]
+        legs = [np.isin(range(1, tree.njoints), tree.supports[x.joint]) for x in tips]
         mass = np.array([x.mass for x in list(tree.inertias)[1:]])
-        left = mass * (1 + np.array(share)) / (2 * mass.sum())
-        right = mass / mass.sum() - left
-        reach = float(left @ sides[0] + right @ sides[1])
-        stance = stance_configuration(body.robot)
-        com = pin.centerOfMass(tree, tree.createData(), stance)
-        body.made["reach"] = reach, com - left.sum() * body.places[0] - right.sum() * body.places[1]
+        share = mass / mass.sum() * (1 + np.subtract(legs, legs[::-1], dtype=float)) / 2
+        com = pin.centerOfMass(tree, tree.createData(), stance_configuration(body.robot))
+        body.made["reach"] = float((share * sides).sum()), com - share.sum(axis=1) @ body.places
     return body.made["reach"]
 
 
@@ -125,12 +120,10 @@ def _distances(tree: pin.Model, foot: int, tip: np.ndarray) -> np.ndarray:
     while left:  # where the way comes into a body, how long it is, and from where
         body, entry, way, before = left.pop()
         out[body] = way + np.linalg.norm(tree.inertias[body].lever - entry)
-        parent = tree.parents[body]
-        if parent not in (0, before):
-            origin = tree.jointPlacements[body].translation
-            left.append((parent, origin, way + np.linalg.norm(entry), body))
-        for child in tree.children[body]:
-            if child != before:
-                origin = tree.jointPlacements[child].translation
-                left.append((child, np.zeros(3), way + np.linalg.norm(origin - entry), body))
+        origins = tree.jointPlacements
+        beside = [(tree.parents[body], np.zeros(3), origins[body].translation)]
+        beside += [(k, origins[k].translation, np.zeros(3)) for k in tree.children[body]]
+        for other, here, there in beside:
+            if other not in (0, before):
+                left.append((other, there, way + np.linalg.norm(here - entry), body))
     return out[1:]

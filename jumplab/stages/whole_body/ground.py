@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.errors import InfeasibleError
 from jumplab.robot import Robot
@@ -75,11 +76,10 @@ def surface_of_jump(body: Body, limits: Limits, task: JumpTask) -> Surface:
     Raises :class:`InfeasibleError` for a platform so near that a sole would stand across its edge.
     """
     foot = body.robot.foot
-    c = np.cos(task.yaw_rad)
-    s = np.sin(task.yaw_rad)
-    along = np.array([np.cos(task.along_rad), np.sin(task.along_rad)])
+    turn = pin.rpy.rpyToMatrix(0.0, 0.0, task.yaw_rad)[:2, :2]
+    along = Surface(along_rad=task.along_rad).along
     corners = (body.places[:, None] + foot.corners - foot.tip).reshape(-1, 3)[:, :2]
-    landed = [task.distance_m, task.side_m] + corners @ np.array([[c, s], [-s, c]])
+    landed = [task.distance_m, task.side_m] + corners @ turn.T
     leaving = float((corners @ along).max())
     arriving = float((landed @ along).min())
     apart = arriving - leaving - limits.edge_before_heel_m

@@ -15,9 +15,6 @@ from jumplab.stages.whole_body.body import Body
 LEG_STEPS = 3  # of Newton's method from errors below a millimetre
 HELD_M = 1e-10  # [m, rad] closer, a foot is in its place
 
-# charts, rates, accelerations, each (n, 6 + joints)
-Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
-
 
 def off_foothold(tree: SpatialState, body: Body, side: int, place: ca.SX, yaw: ca.SX) -> ca.SX:
     """Deviation of a foot from its foothold (6,): the middle of its toe edge from a ``place`` (3,)
@@ -68,21 +65,24 @@ class Legs:
         return body.made[key]
 
     def held(
-        self, motion: Motion, holds: Mapping[int, np.ndarray], pitch: Mapping[int, Motion]
-    ) -> Motion:
-        """The motion with the legs moved so that the feet stay in their places.
+        self, motion: np.ndarray, holds: Mapping[int, np.ndarray], raised: Sequence[int]
+    ) -> np.ndarray:
+        """Charts, rates and accelerations (3, n, 6 + joints) of a ``motion`` with the legs moved so
+        that the feet stay in their places.
 
-        ``holds`` are x, y, z [m] and yaw [rad] of the middles of the toe edges, ``pitch`` angle,
-        rate and acceleration (n,) of each foot on its toes, by side.
+        Behind its charts a motion has the pitch of the feet that are ``raised`` on their toes;
+        ``holds`` are x, y, z [m] and yaw [rad] of the middles of the toe edges, by side.
         """
-        q, v, a = (x.copy() for x in motion)
+        size = len(self.body.stance)
+        q, v, a = held = motion[..., :size].copy()
+        angle, rate, gain = motion[..., size:]
         n = len(q)
         given = np.tile(np.column_stack(list(holds.values())), n)
         goals = np.zeros((3, n, self._place.size1_out(0)))
-        for side, (angle, rate, gain) in pitch.items():
-            s = np.sin(angle)
-            c = np.cos(angle)
-            goals[:, :, self.pitches[side]] = -s, -c * rate, s * rate**2 - c * gain
+        s = np.sin(angle)
+        c = np.cos(angle)
+        pitches = [self.pitches[side] for side in raised]
+        goals[..., pitches] = -s, -c * rate, s * rate**2 - c * gain
         for left in range(LEG_STEPS, -1, -1):
             rows, slope = (x.full() for x in self._place.map(n)(q.T, given))
             slope = slope.reshape(len(rows), n, -1).transpose(1, 0, 2)
@@ -93,10 +93,10 @@ class Legs:
         for level, x in enumerate((v, a)):
             reached = self._levels.map(n)(q.T, v.T, a.T, given)[level].full().T
             x[:, self.columns] += _least(slope, goals[1 + level] - reached)
-        return q, v, a
+        return held
 
 
 def _least(slope: np.ndarray, missed: np.ndarray) -> np.ndarray:
     """Least changes (n, .) of the columns that make up for what is missed (n, k)."""
     across = slope.transpose(0, 2, 1)
-    return (across @ np.linalg.solve(slope @ across, missed[..., None]))[..., 0]
+    return np.matvec(across, np.linalg.solve(slope @ across, missed[..., None])[..., 0])

@@ -269,9 +269,8 @@ def _folded(body: Body, chart: np.ndarray, share: float) -> np.ndarray:
     fold = FOLD_RAD * _smooth(share / first) * (1 - _smooth((share - last) / (1 - last)))
     for k, sign, _ in body.knees:
         folded[BASE + k] += sign * fold
-    hips = zip(body.robot.joints["hip_pitch"], body.robot.sagittal.signs[0], strict=True)
-    for name, sign in hips:
-        folded[BASE + body.joint_names.index(name)] -= sign * fold
+    for column, sign in body.hips:
+        folded[column] -= sign * fold
     return folded
 
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 
-from jumplab.models.spatial import SpatialModel, SpatialState
+from jumplab.models.spatial import SpatialState
 
 # by which the corner of a box gives way, so that the distance has a slope everywhere
 ROUNDED_M = 1e-3
@@ -69,17 +68,3 @@ class Apart:
     last: int
     pair: Pair
     more_m: float = 0.0
-
-
-def boxes(geometry: pin.GeometryModel, model: SpatialModel) -> list[Box]:
-    """The boxes of all links [m], in the order of their collision shapes."""
-    out = []
-    for shape in geometry.geometryObjects:
-        shape.geometry.computeLocalAABB()
-        low = shape.geometry.aabb_local.min_
-        high = shape.geometry.aabb_local.max_
-        body = shape.parentJoint - 1
-        centre = model.local(shape.parentJoint, shape.placement.act((low + high) / 2))
-        axes = model.bodies[body].own.T @ shape.placement.rotation
-        out.append(Box(shape.name, body, centre, axes, (high - low) / 2))
-    return out

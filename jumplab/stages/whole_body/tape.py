@@ -17,14 +17,14 @@ import pinocchio as pin
 
 from jumplab.io.tape import AIR, FLAT, RATE_HZ, TOE, Tape
 from jumplab.models.spatial import SpatialModel
-from jumplab.ocp.solution import PhaseSolution, quintic
+from jumplab.ocp.solution import PhaseSolution, quintic, resampled
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet
 from jumplab.robot.legs import LOCAL, bring_feet, give_of, least_motion
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import HOLD, SIDES
 from jumplab.stages.whole_body.coordinates import BASE
-from jumplab.stages.whole_body.legs import Legs, Motion
+from jumplab.stages.whole_body.legs import Legs
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.problem import Schedule
 
@@ -50,7 +50,7 @@ class Piece:
     """
 
     t: np.ndarray  # (n,) [s]
-    motion: Motion
+    motion: np.ndarray  # (3, n, 6 + joints) charts, rates, accelerations
     wrench: np.ndarray  # (n, 2, 6) of the feet about the world's origin, as planned
     contacts: np.ndarray  # (n, 2) codes
 
@@ -75,7 +75,7 @@ def make_tape(schedule: Schedule, phases: Mapping[str, PhaseSolution], gravity: 
         else:
             pieces.append(_ground(schedule, solved, numbers, before, t, starts, robot))
     t = np.concatenate([p.t for p in pieces])
-    motion = [np.concatenate(x) for x in zip(*(p.motion for p in pieces), strict=True)]
+    motion = np.concatenate([p.motion for p in pieces], axis=1)
     q, v, a = body.model.to_pinocchio(*motion)
     wrench = np.concatenate([p.wrench for p in pieces])
     contacts = np.concatenate([p.contacts for p in pieces])
@@ -137,14 +137,12 @@ def _travel(robot: Robot, origin: np.ndarray, turn: np.ndarray) -> dict[str, np.
     return {"soles_travel": middle[1] - middle[0], "feet_turn": np.array(turned[-1] - turned[0])}
 
 
-def _joining(
-    before: Sequence[np.ndarray], after: Sequence[np.ndarray], t: np.ndarray, most_s: float
-) -> Motion:
-    """Motion (n, k) on three levels to add to one that begins at ``after`` (k,) each, so that it
-    begins at ``before`` and is itself again after :data:`JOINING_S`, ``most_s`` at the latest;
-    ``t`` (n,) since then [s].
+def _joining(before: np.ndarray, after: np.ndarray, t: np.ndarray, most_s: float) -> np.ndarray:
+    """Motion (3, n, k) to add to one that begins at ``after`` (3, k), so that it begins at
+    ``before`` (3, k) and is itself again after :data:`JOINING_S`, ``most_s`` at the latest; ``t``
+    (n,) since then [s].
     """
-    ends = [(x - y, np.zeros(len(x))) for x, y in zip(before, after, strict=True)]
+    ends = [(x, 0 * x) for x in before - after]
     lasts = min(JOINING_S, most_s)
     return quintic(ends, lasts, np.minimum(t, lasts)[:, None])
 
@@ -187,34 +185,26 @@ def _ground(
         phase = solved[k]
         instants = t[owner == k]
         at = np.clip(instants - starts[k], 0.0, phase.duration)
-        sampled = phase.sample(at)
-        motion = [x[:, : b.nv] for x in sampled]
+        motion = phase.sample(at)
         if before is not None:  # accelerations may jump where a foot lands
-            ends = [x[-1] for x in before.motion]
+            end = before.motion[:, -1]
             first = solved[numbers[0]]
-            after = (first.q[0, : b.nv], first.v[0, : b.nv], ends[2])
-            more = _joining(ends, after, instants - t[0], t[-1] - t[0])
-            motion = [x + y for x, y in zip(motion, more, strict=True)]
-        pitch = {side: [x[:, b.nv + i] for x in sampled] for i, side in enumerate(b.raised)}
+            after = np.array([first.q[0, : b.nv], first.v[0, : b.nv], end[2]])
+            motion[..., : b.nv] += _joining(end, after, instants - t[0], t[-1] - t[0])
         holds = holds_of(phase, b)
         legs = Legs.of(schedule.body, list(holds))
         wrench, contacts = _planned(b, phase, holds, at)
         leaves = k + 1 < len(solved) and schedule.modes[k + 1].flying
-        line = _on_a_line(holds, pitch) and not (schedule.follows and len(holds) == 1)
+        line = _on_a_line(holds, b.raised) and not (schedule.follows and len(holds) == 1)
         if len(instants) > 1 and (line or leaves or schedule.follows):
             count = 1 if line else max(1, round((instants[-1] - instants[0]) / BALANCED_S))
-            rows = np.array_split(np.arange(len(instants)), count)
-            balanced = []
-            for part in rows:
-                tipped = {side: [x[part] for x in levels] for side, levels in pitch.items()}
-                given = tipped, holds, instants[part], robot, wrench[part].sum(axis=1), line
-                stays = not leaves or part is not rows[-1]
-                balanced.append(_balanced(legs, [x[part] for x in motion], *given, stays=stays))
-            motion = [np.concatenate(x) for x in zip(*balanced, strict=True)]
-        motion = legs.held(motion, holds, pitch)
-        parts.append((motion, wrench, contacts))
+            for rows in np.array_split(np.arange(len(instants)), count):
+                given = holds, b.raised, instants[rows], robot, wrench[rows].sum(axis=1), line
+                stays = not leaves or rows[-1] + 1 < len(instants)
+                motion[:, rows] = _balanced(legs, motion[:, rows], *given, stays=stays)
+        parts.append((legs.held(motion, holds, b.raised), wrench, contacts))
     motions, wrenches, codes = zip(*parts, strict=True)
-    motion = tuple(np.concatenate(x) for x in zip(*motions, strict=True))
+    motion = np.concatenate(motions, axis=1)
     return Piece(t, motion, np.concatenate(wrenches), np.concatenate(codes))
 
 
@@ -226,7 +216,7 @@ def _planned(
     """
     wrench = np.zeros((len(at), 2, 6))
     codes = np.full((len(at), 2), AIR, np.int8)
-    z = np.array([np.interp(at, phase.t, x) for x in phase.z[:, : b.n_forces].T]).T
+    z = resampled(phase.t, phase.z[:, : b.n_forces], at)
     sizes = [len(b.edges) * len(b.points[side]) for side in holds]
     parts = np.split(z, np.cumsum(sizes)[:-1], axis=1)
     for (side, hold), part in zip(holds.items(), parts, strict=True):
@@ -235,26 +225,27 @@ def _planned(
     return wrench, codes
 
 
-def _on_a_line(holds: Mapping[int, np.ndarray], pitch: Mapping[int, Motion]) -> bool:
+def _on_a_line(holds: Mapping[int, np.ndarray], raised: Sequence[int]) -> bool:
     """Whether all feet that carry are on their toes, and their edges parts of one level line."""
     edge = np.array(list(holds.values()))
     ahead = edge[:, :2] @ [np.cos(edge[0, 3]), np.sin(edge[0, 3])]
     level = np.ptp(edge[:, 2:], axis=0).max() < 1e-6 and np.ptp(ahead) < 1e-4
-    return len(pitch) == len(holds) and level
+    return len(raised) == len(holds) and level
 
 
 def _balanced(
     legs: Legs,
-    motion: Motion,
-    pitch: Mapping[int, Motion],
+    motion: np.ndarray,
     holds: Mapping[int, np.ndarray],
+    raised: Sequence[int],
     t: np.ndarray,
     robot: Robot,
     wrench: np.ndarray,
     line: bool,
     stays: bool,
-) -> Motion:
-    """The motion, its base moved by some micrometres so that the ground's force is what is planned.
+) -> np.ndarray:
+    """The ``motion`` (as of :meth:`.Legs.held`), its base moved by some micrometres so that the
+    ground's force is what is planned.
 
     Where all feet that carry are on their toes, in one ``line``, no ground force has a moment about
     it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides the
@@ -263,7 +254,6 @@ def _balanced(
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
-    q, v, a = (x.copy() for x in motion)
     edge = np.mean(list(holds.values()), axis=0)
     ahead, across, _ = pin.rpy.rpyToMatrix(0.0, 0.0, edge[3]).T
     every = np.arange(len(t))
@@ -273,10 +263,9 @@ def _balanced(
     data = model.createData()
 
     def missing(change: np.ndarray | float = 0.0, rows: np.ndarray = every) -> np.ndarray:
-        gain = a[rows].copy()
-        gain[:, :BASE] += change
-        tipped = {side: [x[rows] for x in levels] for side, levels in pitch.items()}
-        held = legs.held((q[rows], v[rows], gain), holds, tipped)
+        moved = motion[:, rows]
+        moved[2, :, :BASE] += change
+        held = legs.held(moved, holds, raised)
         states = zip(*legs.body.model.to_pinocchio(*held), strict=True)
         need = [needed(x[0], pin.rnea(model, data, *x)) for x in states]
         force, about = np.split(np.array(need) - wrench[rows], 2, axis=1)
@@ -288,19 +277,16 @@ def _balanced(
     slopes = np.stack([missing(way, some) - first[some] for way in ways], axis=-1)
     back = np.linalg.pinv(slopes)[np.searchsorted(some, every)]
     for k in range(BALANCING + (not line)):
-        more = -_times_each(back, missing() if k else first) @ ways
+        more = -np.matvec(back, missing() if k else first) @ ways
         rate = cumulative_trapezoid(more, t, axis=0, initial=0.0)
         place = cumulative_trapezoid(rate, t, axis=0, initial=0.0)
+        shift = np.array([place, rate, more])
         if stays and not line:
             none = np.zeros(BASE)
             ends = [(none, place[-1]), (none, rate[-1]), (none, none)]
-            back_again = quintic(ends, t[-1] - t[0], (t - t[0])[:, None])
-            place, rate, more = (
-                x - y for x, y in zip((place, rate, more), back_again, strict=True)
-            )
-        for x, change in ((q, place), (v, rate), (a, more)):
-            x[:, :BASE] += change
-    return q, v, a
+            shift -= quintic(ends, t[-1] - t[0], (t - t[0])[:, None])
+        motion[..., :BASE] += shift
+    return motion
 
 
 def needed(q: np.ndarray, torques: np.ndarray) -> np.ndarray:
@@ -330,20 +316,19 @@ def _flight(
     model = body.model
     since = t - t[0]
     planned = flight.sample(since)
-    last = [x[-1, BASE:] for x in before.motion]
-    more = _joining(last, [x[0, BASE:] for x in planned], since, since[-1])
-    joints = [x[:, BASE:] + y for x, y in zip(planned, more, strict=True)]
-    fall = Fall(robot, model, before.motion)
-    missed = _arriving(body, [x[-1:, : len(model.names)] for x in planned], sides)
+    last = before.motion[:, -1:]
+    more = _joining(last[:, 0, BASE:], planned[:, 0, BASE:], since, since[-1])
+    joints = planned[..., BASE:] + more
+    fall = Fall(robot, model, last)
+    missed = _arriving(body, planned[:, -1:], sides)
     none = np.zeros(model.joints)
     near = planned[0][:, 3:BASE]
 
-    def fallen(change: np.ndarray, rows: slice = slice(None)) -> Motion:
+    def fallen(change: np.ndarray, rows: slice = slice(None)) -> tuple[np.ndarray, ...]:
         """The motion if joints and their rates end with a change (2 joints,)."""
         shift, rate = np.split(change, 2)
         bends = quintic([(none, shift), (none, rate), (none, none)], since[-1], since[:, None])
-        bent = tuple(x + y for x, y in zip(joints, bends, strict=True))
-        return fall.motion(bent, since, near, rows)
+        return fall.motion(joints + bends, since, near, rows)
 
     # the change moves the base as well, in a jump by little, in a flip by about as much
     options = dict(alpha=1.0, f_tol=LANDED_RAD, maxiter=LANDINGS, line_search=None)
@@ -357,24 +342,25 @@ def _flight(
     return Piece(t, chart, np.zeros((len(t), 2, 6)), codes)
 
 
-def _arriving(body: Body, end: Motion, sides: Sequence[int]) -> Callable[..., np.ndarray]:
+def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[..., np.ndarray]:
     """By what joints and their rates (2 joints,) have to change for the feet of some ``sides`` to
-    arrive as at a planned ``end`` (1, .), from a configuration (1, nq), twist and its rate (1, nv).
+    arrive as at a planned ``end`` (3, 1, .), from a configuration (1, nq), twist and its rate (1,
+    nv).
     """
     tree = body.model.model
     data = tree.createData()
     give = give_of(body.robot)
-    feet = on_feet(body.robot, np.zeros(3))
+    anchors = on_feet(body.robot, np.zeros(3))
+    feet = [anchors[side] for side in sides]
 
     def slopes(q: np.ndarray) -> np.ndarray:
         """(6 k, nv) of the feet's twists, in their axes."""
         pin.computeJointJacobians(tree, data, q)
-        each = [(feet[side].joint, feet[side].placement) for side in sides]
-        return np.vstack([pin.getFrameJacobian(tree, data, *foot, LOCAL) for foot in each])
+        return np.vstack([foot.slope(tree, data, LOCAL) for foot in feet])
 
     q, v, _ = (x[0] for x in body.model.to_pinocchio(*end))
     speeds = slopes(q) @ v
-    goals = {feet[side]: data.oMi[feet[side].joint] * feet[side].placement for side in sides}
+    goals = {foot: foot.place(data) for foot in feet}
 
     def missed(q: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
         there, _ = bring_feet(tree, data, q[0], goals, give)
@@ -386,7 +372,7 @@ def _arriving(body: Body, end: Motion, sides: Sequence[int]) -> Callable[..., np
 
 
 class Fall:
-    """A free fall from the end of a ``motion`` (n, nv): what the base does while the joints of a
+    """A free fall from an ``end`` (3, 1, nv) of a motion: what the base does while the joints of a
     ``robot``, whose model feels gravity, move.
 
     Attributes
@@ -395,23 +381,22 @@ class Fall:
     angles : (3,) yaw, roll and pitch of the base at its beginning [rad].
     """
 
-    def __init__(self, robot: Robot, model: SpatialModel, motion: Motion):
+    def __init__(self, robot: Robot, model: SpatialModel, end: np.ndarray):
         self.robot = robot
         self.model = model
-        last = [x[-1:] for x in motion]
-        q, v, _ = (x[0] for x in model.to_pinocchio(*last))
+        q, v, _ = (x[0] for x in model.to_pinocchio(*end))
         data = robot.model.createData()
         momentum = pin.computeCentroidalMomentum(robot.model, data, q, v)
         self.com = data.com[0].copy()
         self.velocity = momentum.linear / model.mass
         self.spin = momentum.angular.copy()
-        self.angles = last[0][0, 3:BASE]
+        self.angles = end[0, 0, 3:BASE]
 
     def motion(
-        self, joints: Motion, t: np.ndarray, near: np.ndarray, rows: slice = slice(None)
-    ) -> Motion:
+        self, joints: np.ndarray, t: np.ndarray, near: np.ndarray, rows: slice = slice(None)
+    ) -> tuple[np.ndarray, ...]:
         """Configurations (m, nq), twists and accelerations (m, nv) at some ``rows`` of times ``t``
-        (n,) [s], from the angles, rates and accelerations of the ``joints``, each (n, joints); the
+        (n,) [s], from the angles, rates and accelerations of the ``joints`` (3, n, joints); the
         base's angles are sought at ``near`` (n, 3).
         """
         tree = self.robot.model
@@ -431,7 +416,7 @@ class Fall:
             a[k, :BASE] = -np.linalg.solve(pin.crba(tree, data, q[k])[:BASE, :BASE], missing)
         return q, v, a
 
-    def _spins(self, joints: Motion) -> tuple[np.ndarray, np.ndarray]:
+    def _spins(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Angular velocity of the base per L (n, 3, 3), and L that the joints carry (n, 3), in the
         base's axes.
         """
@@ -458,19 +443,14 @@ class Fall:
 
         angles = near
         for _ in range(TURNS):
-            turn, slope = self.model.attitudes(np.pad(angles, ((0, 0), (3, 0))))
-            spin = _times_each(yielding, self.spin @ turn - carried)
+            turn, slope = self.model.attitudes(angles)
+            spin = np.matvec(yielding, self.spin @ turn - carried)
             rates = np.linalg.solve(slope, spin[..., None])[..., 0]
             before = angles
             angles = self.angles + cumulative_simpson(rates, x=t, axis=0, initial=0.0)
             if np.abs(angles - before).max() < TURNED_RAD:
                 break
         return angles, rates
-
-
-def _times_each(matrices: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Products (n, k) of matrices (n, k, l) and columns (n, l)."""
-    return np.einsum("nij,nj->ni", matrices, columns)
 
 
 # forces
@@ -494,29 +474,25 @@ def forces(
     model = robot.model
     data = model.createData()
     joints = [anchor.joint for anchor in on_feet(robot, np.zeros(3))]
-    n = len(q)
-    torques = np.empty((n, model.nv))
-    com = np.empty((n, 3))
-    momentum = np.empty((n, 6))
-    need = np.zeros((n, 6))
-    slopes = np.zeros((n, 2, 6, model.nv))
-    for k in range(n):
-        torques[k] = pin.rnea(model, data, q[k], v[k], a[k])
-        momentum[k] = pin.computeCentroidalMomentum(model, data, q[k], v[k]).vector
-        com[k] = data.com[0]
-        if contacts[k].any():
-            need[k] = needed(q[k], torques[k])
-            pin.computeJointJacobians(model, data, q[k])
-            for i, joint in enumerate(joints):
-                slopes[k, i] = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.WORLD)
-    origin, turn = feet
     s = contacts.any(axis=1)
-    total = np.zeros((n, 2, 6))
+    rows = []
+    slopes = []
+    for *x, stands in zip(q, v, a, s, strict=True):
+        need = pin.rnea(model, data, *x).copy()
+        momentum = pin.computeCentroidalMomentum(model, data, *x[:2]).vector
+        rows.append((need, needed(x[0], need), momentum, data.com[0].copy()))
+        if stands:
+            pin.computeJointJacobians(model, data, x[0])
+            world = pin.ReferenceFrame.WORLD
+            slopes.append([pin.getJointJacobian(model, data, j, world) for j in joints])
+    torques, need, momentum, com = map(np.array, zip(*rows, strict=True))
+    origin, turn = feet
+    total = np.zeros_like(wrench)
     least = LEAST_LOAD * robot.total_mass * robot.gravity
     soles = (origin + turn @ robot.foot.center)[s]
     missing = need[s] - wrench[s].sum(axis=1)
     total[s] = wrench[s] + _shared(wrench[s], soles, contacts[s], missing, least)
-    torques -= np.einsum("nkij,nki->nj", slopes, total)
+    torques[s] -= np.einsum("nkij,nki->nj", slopes, total[s])
     total[..., 3:] -= np.cross(origin, total[..., :3])
     tau = torques[:, 6:] + robot.limits.lost(v[:, 6:])
     extra = {
@@ -534,8 +510,8 @@ def _shared(
     at its centre of pressure, which without load is the middle of its sole (n, 2, 3) [m].
     """
     lift = wrench[..., 2:3]
-    pressed = np.stack([-wrench[..., 4], wrench[..., 3], 0 * wrench[..., 2]], -1)
-    at = np.where(lift > 0, pressed / np.where(lift > 0, lift, 1.0), soles)
+    lever = np.cross([0.0, 0.0, 1.0], wrench[..., 3:])
+    at = np.where(lift > 0, lever / np.where(lift > 0, lift, 1.0), soles)
     load = np.maximum(lift, least) * (contacts > 0)[..., None]
     share = load / load.sum(axis=1, keepdims=True)
     force = share * missing[:, None, :3]

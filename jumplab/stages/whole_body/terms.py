@@ -5,13 +5,12 @@ nothing here solves.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from jumplab.models.spatial import SpatialState, cross
-from jumplab.ocp.problem import Term
+from jumplab.ocp.problem import Term, limit
 from jumplab.robot.reduction import mirror
 from jumplab.stages.whole_body.contacts import SIDES
 from jumplab.stages.whole_body.coordinates import BASE
@@ -59,7 +58,7 @@ def smoothness(m: Mode) -> list[Term]:
     terms = [
         Term("acceleration", origin, "rad/s^2", "node", lambda p: m.moving(p.a), w.acceleration),
         Term("jerk", origin, "rad/s^3", "mid", lambda p: m.moving(p.j), w.jerk),
-        Term("torque", "ours: effort", "N m", "node", lambda p: p.joint_torques, w.torque),
+        Term("torque", "ours: effort", "N m", "node", "joint_torques", w.torque),
     ]
     if not m.flying:
         terms.append(
@@ -107,7 +106,7 @@ def dynamics(m: Mode, skip: tuple[int, int]) -> list[Term]:
         locked = [m.limits.torque_share * x.effort for x in m.locked]
         most = np.array([*m.usable_torques[m.held], *locked]) / effort
         words = HOLDING, "ours: limit", "of the effort", "node"
-        rows.append(Term(*words, holding, lower=-most, upper=most, **shared))
+        rows.append(limit(*words, holding, -most, most, **shared))
     return rows
 
 
@@ -121,7 +120,7 @@ def motor_lines(m: Mode, skip: tuple[int, int]) -> Term:
         return (p.motor_torques + ca.DM(slope) * p.rates) / ca.DM(motors.effort)
 
     words = TORQUE_SPEED, "ours: motor line", "of the effort", "node"
-    return Term(*words, line, lower=-most, upper=most, skip=skip)
+    return limit(*words, line, -most, most, skip=skip)
 
 
 def body_clearance(m: Mode) -> Term:
@@ -149,7 +148,7 @@ def body_clearance(m: Mode) -> Term:
 
     least = np.array([least for _, least in limbs] + [0.0] * len(shanks))
     words = "body clearance", "ours", "m", "node"
-    return Term(*words, heights, lower=least, upper=np.inf, skip=(1, 0), **CLEAR)
+    return limit(*words, heights, least, skip=(1, 0), **CLEAR)
 
 
 def sides_apart(m: Mode) -> list[Term]:
@@ -188,19 +187,18 @@ def sides_apart(m: Mode) -> list[Term]:
         return ca.DM(way) * across(p.tree)
 
     words = "sides apart", "ours", "m", "node"
-    return [Term(*words, rows, lower=least, upper=np.inf, skip=(1, 0), **CLEAR)]
+    return [limit(*words, rows, least, skip=(1, 0), **CLEAR)]
 
 
 def link_distance(m: Mode, kept: Apart, intervals: int) -> Term:
     """Two links stay apart [m] at the nodes for which it is asked, of a phase of ``intervals``."""
-    return Term(
+    return limit(
         kept.pair.key,
         "ours",
         "m",
         "node",
         lambda p: kept.pair.gap(p.tree),
-        lower=m.limits.link_distance_m + kept.more_m,
-        upper=np.inf,
+        m.limits.link_distance_m + kept.more_m,
         scale=PLACE_SCALE,
         skip=(kept.first, intervals - kept.last),
         group=kept.pair.key,
@@ -221,7 +219,7 @@ def gentle_heels(m: Mode) -> Term:
     """
     most = m.limits.heel_jerk
     words = "heels rise gently", "ours: the tape's steps", "rad/s^3", "mid"
-    return Term(*words, lambda p: p.j[m.nv :], lower=-most, upper=most, scale=most)
+    return limit(*words, lambda p: p.j[m.nv :], -most, most, scale=most)
 
 
 # feet on the ground
@@ -279,8 +277,7 @@ def loads(m: Mode) -> Term:
     def forces(p):
         return ca.vertcat(*(p.feet_forces[side][2] for side in m.sides))
 
-    words = "load of each foot", "ours", "N", "node"
-    return Term(*words, forces, lower=least, upper=np.inf, scale=mg)
+    return limit("load of each foot", "ours", "N", "node", forces, least, scale=mg)
 
 
 def torsion(m: Mode, side: int) -> Term:
@@ -296,7 +293,7 @@ def torsion(m: Mode, side: int) -> Term:
 
     words = f"spin of {SIDES[side]} foot", "ours: friction", "m, of the squared weight", "node"
     how = {"scale": MOMENT_ARM_M / 10, "group": "torsion"}
-    return Term(*words, left, lower=-TORSION_SLACK_M, upper=np.inf, **how)
+    return limit(*words, left, -TORSION_SLACK_M, **how)
 
 
 def reserve(m: Mode) -> list[Term]:
@@ -318,7 +315,7 @@ def reserve(m: Mode) -> list[Term]:
         return ca.vertcat(*rows)
 
     words = "CoP reserve", "ours", "m, of the weight", "node"
-    return [Term(*words, left, upper=np.inf, scale=PLACE_SCALE)]
+    return [limit(*words, left, scale=PLACE_SCALE)]
 
 
 # feet in the air
@@ -346,7 +343,7 @@ def swing_rows(m: Mode, side: int, follows: bool) -> Term:
         return ca.vertcat(*(x[2] - p.ground(x) - low for x, low in zip(points, lows, strict=True)))
 
     words = f"clearance of {SIDES[side]} sole", "ours", "m", "node"
-    return Term(*words, heights, upper=np.inf, skip=(1, 1), **CLEAR)
+    return limit(*words, heights, skip=(1, 1), **CLEAR)
 
 
 def flight_rows(m: Mode) -> list[Term]:
@@ -373,14 +370,12 @@ def flight_rows(m: Mode) -> list[Term]:
         return turned - step**2 * (left.a[at] - right.a[at]) / 12
 
     link = {"identity": True, "group": "flight"}
-    kept = "WF-D1, three components"
     spin = {"scale": SPIN_SCALE, "group": "flight"}
-    turns = "base turns", "state equation", "rad", "interval"
     return [
         Term("ballistic CoM", "WF-D1", "m", "node", com, **link),
         Term("ballistic CoM velocity", "WF-D1", "m/s", "node", velocity, **link),
-        Term("angular momentum", kept, "kg m^2/s", "node", momentum, **spin),
-        Term(*turns, angles, identity=True),
+        Term("angular momentum", "WF-D1, three components", "kg m^2/s", "node", momentum, **spin),
+        Term("base turns", "state equation", "rad", "interval", angles, identity=True),
     ]
 
 
@@ -396,7 +391,7 @@ def opening_rows(m: Mode) -> list[Term]:
         return ca.fmax(0, ca.fmin(1, 10 * (p.s - 1 + LATE_SHARE))) * p.rates
 
     words = "opening speed", "ours, for flips", "rad/s", "node"
-    return [Term(*words, rates, lower=-most, upper=most, scale=10.0, skip=(1, 0))]
+    return [limit(*words, rates, -most, most, scale=10.0, skip=(1, 0))]
 
 
 # touchdown at the end of the schedule
@@ -424,13 +419,14 @@ def touchdown_rows(m: Mode) -> list[Term]:
     bent = min(lim.touchdown_knee[0], body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
     trunk = rates_within(m, lim.touchdown_trunk_rate, np.eye(3)[0][angles])
     rate = lim.touchdown_joint_rate
+    turning = "trunk rates at touchdown", "ours", "rad/s", "end"
     return [
         Term("vertical take-off speed", "SL-E2, WL-E1", "m/s", "start", takeoff),
         *touchdown_feet(m),
-        end("attitude at touchdown", "ours", "rad", attitude, low, high),
-        end("knees at touchdown", "ours: stroke", "rad", knees, *bent),
-        end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.rates, -rate, rate),
-        end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[free.turns], *trunk),
+        limit("attitude at touchdown", "ours", "rad", "end", attitude, low, high),
+        limit("knees at touchdown", "ours: stroke", "rad", "end", knees, *bent),
+        limit("joint rates at touchdown", "WF-E1, relaxed", "rad/s", "end", "rates", -rate, rate),
+        limit(*turning, lambda p: p.v[free.turns], *trunk),
         *upright_waist(m),
         *ankle_stroke(m),
         *capture_rows(m),
@@ -444,21 +440,8 @@ def upright_waist(m: Mode) -> list[Term]:
         return []
     most = m.limits.touchdown_waist_rad
     stance = ca.DM(m.body.stance[columns])
-    words = "waist at touchdown", "ours: stroke", "rad"
-    return [end(*words, lambda p: p.tree.q[columns] - stance, -most, most)]
-
-
-def end(
-    name: str,
-    equation: str,
-    unit: str,
-    of: Callable,
-    lower: Any = 0.0,
-    upper: Any = 0.0,
-    scale: float = 1.0,
-) -> Term:
-    """A constraint at the end of the last phase."""
-    return Term(name, equation, unit, "end", of, lower=lower, upper=upper, scale=scale)
+    words = "waist at touchdown", "ours: stroke", "rad", "end"
+    return [limit(*words, lambda p: p.tree.q[columns] - stance, -most, most)]
 
 
 def rates_within(m: Mode, rates: float, vertical: Sequence[float]) -> tuple[Callable, Callable]:
@@ -505,11 +488,11 @@ def touchdown_feet(m: Mode) -> list[Term]:
 
     vertical = np.eye(3)[2][turning].tolist() * len(free.sides)
     spin = rates_within(m, lim.touchdown_foot_rate, vertical)
-    sticks = "soles that stick at touchdown", "ours: friction", "m/s"
+    sticks = "soles that stick at touchdown", "ours: friction", "m/s", "end"
     return [
-        end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", goal),
-        end("foot rates at touchdown", "ours", "rad/s", spins, *spin),
-        *([] if free.plane else [end(*sticks, sliding, 0.0, np.inf)]),
+        Term("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", "end", goal),
+        limit("foot rates at touchdown", "ours", "rad/s", "end", spins, *spin),
+        *([] if free.plane else [limit(*sticks, sliding)]),
     ]
 
 
@@ -519,8 +502,8 @@ def ankle_stroke(m: Mode) -> list[Term]:
     if stroke is None or not m.free.plane:
         return []
     least = float(m.robot.sagittal.lower[2]) + stroke
-    words = "ankles at touchdown", "ours, for flips: stroke", "rad"
-    return [end(*words, lambda p: p.joints.ankle[0], least, np.inf)]
+    words = "ankles at touchdown", "ours, for flips: stroke", "rad", "end"
+    return [limit(*words, lambda p: p.joints.ankle[0], least)]
 
 
 def capture_rows(m: Mode) -> list[Term]:
@@ -537,8 +520,8 @@ def capture_rows(m: Mode) -> list[Term]:
         return caught[[k for k in m.free.places if k < 2]]
 
     window = lim.capture_window_m
-    words = "capture window", f"ours; {CAPTURE}", "m"
-    return [end(*words, capture, -window, window, PLACE_SCALE)]
+    words = "capture window", f"ours; {CAPTURE}", "m", "end"
+    return [limit(*words, capture, -window, window, scale=PLACE_SCALE)]
 
 
 def about(m: Mode, p: Instant, place: ca.SX) -> ca.SX:
@@ -551,8 +534,12 @@ def flip_capture(m: Mode) -> Term:
     """L about the middle of the soles, which the impact does not change."""
     most = m.limits.capture_moment * m.body.spin_size
     level = [k for k in m.free.spins if k < 2]
-    words = "capture by momentum", f"ours, for flips; {CAPTURE}", "kg m^2/s"
-    return end(*words, lambda p: about(m, p, p.sole_middle)[level], -most, most, SPIN_SCALE)
+
+    def momentum(p):
+        return about(m, p, p.sole_middle)[level]
+
+    words = "capture by momentum", f"ours, for flips; {CAPTURE}", "kg m^2/s", "end"
+    return limit(*words, momentum, -most, most, scale=SPIN_SCALE)
 
 
 def flip_capture_in_plane(m: Mode) -> list[Term]:
@@ -578,9 +565,9 @@ def flip_capture_in_plane(m: Mode) -> list[Term]:
 
     ahead = [x * body.spin_size for x in lim.capture_forward]
     back = [x * body.leg_m for x in lim.capture_backward]
-    momentum = "capture by momentum", f"ours, for flips forward; {CAPTURE}", "kg m^2/s"
-    beyond = "capture beyond the toes", f"ours, for flips backward; {CAPTURE}", "m"
+    momentum = "capture by momentum", f"ours, for flips forward; {CAPTURE}", "kg m^2/s", "end"
+    beyond = "capture beyond the toes", f"ours, for flips backward; {CAPTURE}", "m", "end"
     return [
-        end(*momentum, one_way(1, forward, ahead), *ahead, SPIN_SCALE),
-        end(*beyond, one_way(-1, backward, back), *back, PLACE_SCALE),
+        limit(*momentum, one_way(1, forward, ahead), *ahead, scale=SPIN_SCALE),
+        limit(*beyond, one_way(-1, backward, back), *back, scale=PLACE_SCALE),
     ]

@@ -251,8 +251,7 @@ def over_feet(tape: Tape, robot: Robot, q: np.ndarray) -> PPoly:
     for row in rows:
         pin.forwardKinematics(model, data, tape.q[row])
         goals = {
-            anchor: move * data.oMi[anchor.joint] * anchor.placement
-            for anchor, move in zip(anchors, moves, strict=True)
+            anchor: move * anchor.place(data) for anchor, move in zip(anchors, moves, strict=True)
         }
         moved, _ = bring_feet(model, data, tape.q[row], goals, give)
         angles.append(moved[7:] - tape.q[row, 7:])
