@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import brentq
 
 from jumplab.control import LandingController
-from jumplab.control.body import PERIOD_STEPS, WholeBody
+from jumplab.control.body import PERIOD_STEPS, WRENCH_SCALE, WholeBody
 from jumplab.control.landing import GAINS, MAX_BACK
 from jumplab.control.playback import Command
 from jumplab.control.servo import WholeBodyServo
@@ -231,3 +231,29 @@ def test_feet_that_both_bounced_are_pressed_down_again(bhr, gap_m, stands):
         data = bhr.model.createData()
         falls = pin.aba(bhr.model, data, q, v, np.concatenate([np.zeros(6), tau]))
         assert sole_acceleration(bhr, q, v, falls) < -bhr.gravity - 1.0
+
+
+def test_a_joint_whose_motor_is_spent_leans_on_its_stop(bhr):
+    """Knees too weak for a deep crouch rest on their stops: from then on the robot moves as it is believed to."""
+    weak = bhr.with_limits(effort={"knee": 0.02})
+    control, q, v = LandingController(weak), stance_configuration(weak), np.zeros(weak.model.nv)
+    angles = {"knee": 2.39, "hip_pitch": -1.69, "ankle_pitch": -0.9}
+    for role, angle in angles.items():
+        q[[7 + weak.joint_names.index(name) for name in weak.joints[role]]] = angle
+    q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, -sum(angles.values()), 0.0)).coeffs()
+    body, data = WholeBody(weak), weak.model.createData()
+    body.update(q, v)
+    mass, drift = pin.crba(weak.model, data, q), pin.nonLinearEffects(weak.model, data, q, v)
+    knees = body.unknowns[[9, 16], : body.nv]
+    answers = []
+    solve = control.solver.solve
+    control.solver.solve = lambda qp: answers.append(solve(qp)) or answers[-1]
+    wrong = []
+    for _ in range(2):
+        tau = np.concatenate([np.zeros(6), control.torque(0.0, q, v, np.full(2, 200.0))])
+        believed, push = np.split(answers[-1].x, [body.nv])
+        push = body.size.of(WRENCH_SCALE, "N") * push
+        free = np.linalg.solve(mass, tau - drift + np.vstack(body.sole_rows)[:, : body.nv].T @ push)
+        gain = np.linalg.solve(mass, knees.T)
+        wrong.append(np.abs(believed - free + gain @ np.linalg.solve(knees @ gain, knees @ free)).max())
+    assert wrong[1] < 0.01 < 1.0 < wrong[0]

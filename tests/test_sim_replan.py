@@ -7,7 +7,6 @@ import pytest
 
 from jumplab.control import reference as replan
 from jumplab.control.reference import (
-    EVERY_S,
     FIRST_S,
     LATENCY_S,
     UNTIL_S,
@@ -93,13 +92,11 @@ def test_a_capture_point_counts_not_the_place_alone(robot, monkeypatch):
     assert len(planner.asked) == 1
 
 
-def test_without_a_new_landing_the_old_one_is_kept_and_it_tries_again(robot, monkeypatch):
+def test_without_a_new_landing_the_old_one_is_kept_to_the_end(robot, monkeypatch):
     planner = Planner(failing=True)
     again, followed = run(robot, monkeypatch, planner, standing(0.2))
     assert len(set(map(id, followed))) == 1
-    assert again.again["made"] == 0 and again.again["refused"] == len(planner.asked) == 1 + round(
-        (UNTIL_S - FIRST_S) / EVERY_S - 0.5
-    )
+    assert again.again["made"] == 0 and again.again["refused"] == len(planner.asked) == 1
 
 
 def test_stage_1_plans_the_rest_from_a_state_of_the_robot(robot):

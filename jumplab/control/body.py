@@ -19,6 +19,7 @@ NOMINAL_INERTIA = 5.0
 AXES = np.arange(3)
 SPIN_FRICTION = 0.04  # [m] friction coefficient times the mean lever of the sole, about 0.07 m
 SPIN_HALF_WIDTH_M = 0.05  # of that sole: narrow ones turn on their edges under less
+REST_S = 0.01  # in which a joint comes to rest on its stop
 TOLERANCE = 1e-6  # of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
 MAX_ITERATIONS = 300  # ten times what the hardest recorded QP took
 SURELY_NONE = 1e-4  # ProxQP's own; residuals of programs that have no answer
@@ -92,11 +93,19 @@ class WholeBody:
             self.momentum_rows[:, at : at + 3] = unit * pin.skew(self.soles[side] - self.com)
             self.momentum_rows[AXES, at + 3 + AXES] = unit
 
-    def program(self, v: np.ndarray, corners: np.ndarray, moment: np.ndarray | None = None) -> Qp:
+    def program(
+        self,
+        v: np.ndarray,
+        corners: np.ndarray,
+        moment: np.ndarray | None = None,
+        leaning: np.ndarray | None = None,
+    ) -> Qp:
         """A QP without wishes: the base's dynamics, the motors at the rates of ``v`` (nv,), and the
         ground's ``corners``, see :func:`corner_rows`.
 
         ``moment`` (3,) about the CoM is needed besides, by a load that the model lacks [N m].
+        Joints that are ``leaning`` (nv - 6,) on a stop come to rest on it within :data:`REST_S`: it
+        bears what their motors do not.
         """
         offset = self._offset.copy()
         if moment is not None:
@@ -104,7 +113,13 @@ class WholeBody:
         qp = Qp(self.nx)
         qp.equality("base", self._dynamics[:6], -offset[:6])
         low, high = self.motors.range(v[6:])
-        qp.limit("motors", self._dynamics[6:], low - offset[6:], high - offset[6:])
+        rows = self._dynamics[6:].copy()
+        low -= offset[6:]
+        high -= offset[6:]
+        if leaning is not None:
+            rows[leaning] = self.unknowns[6 : self.nv][leaning]
+            low[leaning] = high[leaning] = -v[6:][leaning] / REST_S
+        qp.limit("motors", rows, low, high)
         qp.limit("ground", corners, 0.0)
         return qp
 

@@ -31,6 +31,11 @@ SOLE_SHARE = 0.95, 0.5
 PLANNED_FRICTION = 0.45  # below the lowest floor friction of the perturbed trials, 0.5
 STOP_MARGIN_RAD = 0.05  # a stop is respected this far before it
 STOP_HORIZON_S = 0.05  # a joint that would reach it within this time is turned back ...
+# a joint so close to its stop, whose motor has less to give than this, leans on it: the stop bears
+# the rest. Otherwise a trunk on the stop of a weak waist is believed to fall, and the pelvis sent
+# after it
+TOUCH_RAD = 0.02
+SPENT_N_M = 1e-3
 STOP_LEAVE = 10.0  # [rad/s^2] ... and if it is wished elsewhere, at least so much
 # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
 MAX_SHIFT = 60.0
@@ -118,6 +123,7 @@ class LandingController:
         self._posture_weight = np.where(arms, g.arm_posture_weight, legs_weight)
         self._corners = corner_rows(robot, PLANNED_FRICTION, *SOLE_SHARE)
         self._last_contact = np.full(2, -np.inf)
+        self._leaning = np.zeros(len(robot.joint_names), bool)
         # [m] height of the lowest sole that was loaded last; before, both feet count as standing
         self._ground = np.inf
         # accelerations, wrenches, and what these differ by
@@ -148,10 +154,22 @@ class LandingController:
         answer = self.solver.solve(self._program(time, q, v, contact))
         if answer.solved:
             tau = body.torque(answer.x)
+            self._leaning = self._leans(q, v, tau)
         else:
             damping = body.size.of(FALLBACK_DAMPING, "N m s")
             tau = body.gravity_torque(contact) - damping * v[6:]
         return np.clip(np.round(tau, TORQUE_DIGITS), *body.motors.range(v[6:]))
+
+    def _leans(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        """Which joints (nv - 6,) rest on a stop, since their motors cannot give ``tau`` (nv - 6,)
+        [N m].
+        """
+        motors = self.body.motors
+        low, high = motors.range(v[6:])
+        spent = self.body.size.of(SPENT_N_M, "N m")
+        on_lower = (q[7:] < motors.lower + TOUCH_RAD) & (tau > high - spent)
+        on_upper = (q[7:] > motors.upper - TOUCH_RAD) & (tau < low + spent)
+        return on_lower | on_upper
 
     def standing(self, time: float, foot_force: np.ndarray) -> np.ndarray:
         """Which feet (2,) may carry weight: those whose ``foot_force`` (2,) [N] did a moment before
@@ -170,7 +188,7 @@ class LandingController:
         """The QP of one moment."""
         g = self.gains
         body = self.body
-        qp = body.program(v, self._corners)
+        qp = body.program(v, self._corners, leaning=self._leaning)
         ground = body.soles[contact] if contact.any() else body.soles
         com_wish, momentum_wish = self._balance(time, ground.mean(axis=0))
         if self.step.side is not None:
