@@ -18,7 +18,7 @@ from jumplab.errors import RobotError
 from jumplab.robot.files import LEG, entry, table
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.roles import leg_joints, robot_axes
-from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Tree, link_poses, links_of
+from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Joint, Tree, link_poses, links_of
 from jumplab.robot_import.write import key, listed, shifted
 
 RoleJoints = dict[str, tuple[str, ...]]
@@ -122,8 +122,8 @@ def lump(
             f"the trunk faces {source['forward']}; turn all pairs round by [source] facing, or "
             f"correct [joints]"
         )
-    middle = np.array([0.0, (hips[0][1] + hips[1][1]) / 2, 0.0])
-    model.jointPlacements[1] = pin.SE3(turn, -middle)
+    middle = _between_legs(tree, trunk, feet, pose, turn[1])
+    model.jointPlacements[1] = pin.SE3(turn, np.array([0.0, -middle, 0.0]))
     placed = link_poses(model)
     edges = entry(config, "feet", "sole_y_m", count=2)
     changed = {}
@@ -139,6 +139,23 @@ def lump(
     bodies = _with_mass(bodies, changed)
     bodies = _mirrored(bodies, changed)
     return Lumped({b.name: b for b in bodies}, changed, held, links, placed)
+
+
+def _between_legs(
+    tree: Tree, trunk: str, feet: Sequence[str], pose: dict[str, pin.SE3], left: np.ndarray
+) -> float:
+    """Where the plane between the legs is, along the axis ``left`` (3,) [m].
+
+    It lies amid the first two joints whose axes turn least about that one: along its axis, an
+    origin may lie anywhere.
+    """
+    legs = ([j for j in tree.path_between(trunk, foot) if j.driven] for foot in feet)
+
+    def turning(pair: tuple[Joint, ...]) -> float:
+        return round(abs(left @ pose[pair[0].child].rotation @ pair[0].axis), 2)
+
+    pair = min(zip(*legs, strict=False), key=turning)
+    return float(sum(left @ pose[joint.child].translation for joint in pair) / 2)
 
 
 # what moves, and how far
@@ -332,7 +349,8 @@ def _bodies(
     """The trunk, then outwards a body for each joint of ``limits``, and the body of each link; all
     their mass must hang on the trunk.
 
-    The middle of the left sole is ``beside`` [m] the origin of its link, to the left.
+    The middle of the left sole is ``beside`` [m] the origin of its link, to the left; that of the
+    right one is opposite.
     """
     data = model.createData()
     axes = pin.computeJointJacobians(model, data, pin.neutral(model))[3:].T
@@ -353,8 +371,8 @@ def _bodies(
             axis = _snapped(sign * axes[model.idx_vs[turning]])
         # an origin may lie anywhere on its axis: in the middle of the sole
         if name in feet and abs(axis[1]) == 1:
-            middle = placed[name].translation[1] + (beside if name == feet[0] else -beside)
-            place = np.array([place[0], middle, place[2]])
+            middle = placed[feet[0]].translation[1] + beside
+            place = np.array([place[0], middle if name == feet[0] else -middle, place[2]])
         inertia = (shifted(-place) * data.oMi[carrier]).act(model.inertias[carrier])
         bodies.append(Body(name, parent, joint, place, axis, limits.get(joint, {}), inertia))
         names[carrier] = name
