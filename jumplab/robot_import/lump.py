@@ -58,6 +58,7 @@ class Body:
     # lower, upper [rad], effort [N m], velocity [rad/s]; of MOTOR what is known
     limits: dict[str, float]
     inertia: pin.Inertia  # about ``place``, in the robot's axes
+    level: float = 0.0  # angle of its joint [rad] at which it is as described here
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Lumped:
     changed: dict[str, tuple[float, str]]
     held: dict[str, float]  # joint -> angle [rad] of the joints that no longer move
     links: dict[str, str]  # link of the URDF -> body it belongs to
-    # link -> its place in the robot's axes, those joints held and all others at 0
+    # link -> its place in the robot's axes, those joints held, soles level and all others at 0
     placed: dict[str, pin.SE3]
 
     @property
@@ -124,6 +125,7 @@ def lump(
         )
     middle = _between_legs(tree, trunk, feet, pose, turn[1])
     model.jointPlacements[1] = pin.SE3(turn, np.array([0.0, -middle, 0.0]))
+    levels = _levelled(tree, config, roles, model)
     placed = link_poses(model)
     edges = entry(config, "feet", "sole_y_m", count=2)
     changed = {}
@@ -136,6 +138,7 @@ def lump(
             f"give its link a mass, or name another [source] trunk"
         )
     _check_ranges(tree, bodies, roles)
+    bodies = [replace(body, level=levels.get(body.joint, 0.0)) for body in bodies]
     bodies = _with_mass(bodies, changed)
     bodies = _mirrored(bodies, changed)
     return Lumped({b.name: b for b in bodies}, changed, held, links, placed)
@@ -156,6 +159,21 @@ def _between_legs(
 
     pair = min(zip(*legs, strict=False), key=turning)
     return float(sum(left @ pose[joint.child].translation for joint in pair) / 2)
+
+
+def _levelled(tree: Tree, config: dict, roles: RoleJoints, model: pin.Model) -> dict[str, float]:
+    """Angles of the ankles [rad] at which the soles are level, which are 0 in ``model`` afterwards;
+    {} if they are 0 in the file.
+    """
+    pitch = entry(config, "feet", "level_rad", default=0.0)
+    axes = pin.computeJointJacobians(model, model.createData(), pin.neutral(model))[3:].T
+    out = {}
+    for name in roles["ankle_pitch"] if pitch else ():
+        joint = model.getJointId(name)
+        out[name] = float(pitch * np.sign(axes[model.idx_vs[joint], 1]))
+        turned = pin.exp3(out[name] * tree.joints[name].axis)
+        model.jointPlacements[joint] = model.jointPlacements[joint] * pin.SE3(turned, np.zeros(3))
+    return out
 
 
 # what moves, and how far
