@@ -147,7 +147,7 @@ def lump(
 def _between_legs(
     tree: Tree, trunk: str, feet: Sequence[str], pose: dict[str, pin.SE3], left: np.ndarray
 ) -> float:
-    """Where the plane between the legs is, along the axis ``left`` (3,) [m].
+    """Place of the plane between the legs, along the axis ``left`` (3,) [m].
 
     It lies amid the first two joints whose axes turn least about that one: along its axis, an
     origin may lie anywhere.
