@@ -206,8 +206,8 @@ REFUSED = [
      "robot configuration: 'shapes.thigh_thickness_m' = 0 must be positive"),
     (GOOD, config("x", toe=-0.05),
      "my.urdf: the sole [-0.1  -0.05] x [-0.05  0.05] m, -0.075 m from the ankle, must lie below it and reach to both "
-     "sides of it: the foot stands on its heel or its toes with all joints at 0, or [feet] is wrong; give the sole "
-     "in [feet] along level axes"),
+     "sides of it: the foot stands on its heel or its toes, or [feet] is wrong; give the sole there along level axes, "
+     "and level_rad, the ankles' pitch at which these are level"),
     (GOOD, config("x").replace('["left_knee", "right_knee"]', '["right_knee", "left_knee"]'),
      "my.urdf: the role joint 'right_knee' is not between 'trunk' and the foot 'left_foot'; correct [joints], [feet] "
      "links or their order left, right"),

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from fixtures_robots import refused
 
@@ -487,16 +488,37 @@ def test_feet_that_are_points_and_legs_that_end_in_wheels(put):
         assert words in refused(lambda path=path: draft(path))
 
 
-def test_a_leaning_foot_is_levelled_as_advised(put):
-    """The ankle of a foot that leans by 0.2 rad with all joints at 0 is to count from where it is level."""
+def test_a_leaning_foot_stands_level(put):
+    """Feet that lean by 0.2 rad with all joints at 0 stand flat, in the file's own angles of the ankles."""
     tilted = changed(URDF, ('<origin xyz="0.03 0 -0.05"/><', '<origin xyz="0 0 -.05" rpy="0 .2 0"/><'))
-    sentence = refused(lambda: draft(put(tilted)))
-    advice = r"stands on its toes, 11 deg .*'left_ankle_pitch'.* frame by (\S+) rad about its axis, .* range by (\S+)"
-    turn, shift = map(float, re.search(advice, sentence).groups())
-    level = re.sub(r'(_ankle_pitch_link"/><origin xyz="[^"]*")', rf'\1 rpy="0 {turn} 0"', tilted)
-    level = changed(level, ('lower="-0.9" upper="0.7"', f'lower="{shift - 0.9}" upper="{shift + 0.7}"'))
-    robot = examine(put(level)).robot
-    assert robot.sagittal.upper[2] == pytest.approx(0.89, abs=0.02) and robot.foot.toe == pytest.approx(0.1, abs=0.02)
+    robot = examine(put(tilted)).robot
+    assert not robot.planar and robot.foot.toe == pytest.approx(0.1 + 0.05 * np.sin(0.2), abs=1e-3)
+    model = pin.buildModelFromXML(tilted, pin.JointModelFreeFlyer())
+    q = pin.neutral(model)
+    q[:7] = robot.standing[:7]
+    for name, angle in zip(robot.joint_names, robot.standing[7:], strict=True):
+        q[model.idx_qs[model.getJointId(name)]] = angle
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    for side in ("left", "right"):
+        foot = data.oMi[model.getJointId(f"{side}_ankle_roll")].rotation @ pin.rpy.rpyToMatrix(0, 0.2, 0)
+        np.testing.assert_allclose(foot[2, :2], 0, atol=2e-3)
+
+
+def test_origins_moved_to_one_side_along_their_axes_are_the_same_robot(put):
+    """The pitch joints of both hips have their origins 2 cm farther left on their axes."""
+    moved = URDF
+    for side, y in (("left", 0.09), ("right", -0.09)):
+        link = f'<link name="{side}_hip_pitch_link"><inertial><origin xyz="0 {{}} -0.02"'
+        hip = f'<child link="{side}_hip_pitch_link"/><origin xyz="0 {{:g}} -0.06"'
+        roll = f'<child link="{side}_hip_roll_link"/><origin xyz="0 {{}} 0"'
+        pairs = [(text.format(0), text.format(-0.02)) for text in (link, roll)]
+        moved = changed(moved, *pairs, (hip.format(y), hip.format(y + 0.02)))
+    robot = examine(put(moved)).robot
+    same = examine(put(URDF)).robot
+    assert robot.planar and robot.foot == same.foot
+    for name in ("mass", "inertia", "com", "span"):
+        np.testing.assert_allclose(getattr(robot.sagittal, name), getattr(same.sagittal, name), atol=1e-9)
 
 
 def test_unlike_ranges_are_named_and_mended_as_advised(put):

@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_robots import child, write
 
 from jumplab.robot import Robot
 from jumplab.robot.reach import postures, reach
@@ -58,3 +59,12 @@ def test_heavier_limbs_widen_the_envelope(bhr, envelope):
     heavy = head + '<link name="left_arm">' + tail.replace('<mass value="2" />', '<mass value="8" />')
     other = reach(Robot.from_text(heavy, bhr.config_text), 2**12)
     assert other.inertia[1] > envelope.inertia[1] + 1.0
+
+
+def test_a_small_robot_reaches_as_the_large_one_does(bhr, envelope, tmp_path):
+    """Lengths by which postures are chosen grow with the legs: a quarter of the size has a quarter of the reach."""
+    small = reach(Robot.load(write(tmp_path, child, 0.25)))
+    np.testing.assert_allclose(np.array(small.length) / 0.25, envelope.length, rtol=0.02)
+    low, easy = (np.polyval(x, 0.0) / 0.25 for x in (small.low_com_fit, small.easy_com_fit))
+    assert low == pytest.approx(np.polyval(envelope.low_com_fit, 0.0), abs=0.02)
+    assert easy == pytest.approx(np.polyval(envelope.easy_com_fit, 0.0), abs=0.02)

@@ -13,11 +13,12 @@ from itertools import pairwise
 import numpy as np
 
 from jumplab.robot.description import Robot
+from jumplab.robot.legs import size
 from jumplab.robot.sagittal import TO_COMPLEX, SagittalModel
 from jumplab.robot.stance import stance_angles
 
 # which postures are sampled, and how the envelopes are drawn around them; the paper prints none
-# of this
+# of this; lengths are the default robot's, scaled for others by their legs
 SAMPLES = 2**16  # twice as many move the envelopes by less than 1 %
 TRUNK_RAD = (-0.30, 1.30)  # a backward lean that looks like falling; a deep bow
 HEEL_UP_RAD = 0.5  # foot pitch that still pushes off
@@ -69,7 +70,8 @@ def postures(
     *,
     strength: bool = True,
 ) -> dict[str, np.ndarray]:
-    """Sampled postures within joint ranges, toe on the ground, heel up by at most ``heel_up_rad``.
+    """Sampled postures within joint ranges, toe on the ground, heel up by at most ``heel_up_rad``,
+    the CoM ahead of mid-sole within ``com_x_m`` (scaled by the legs).
 
     Returns arrays angles (n, 5) [rad], com (n, 2) from mid-sole [m], shoulder [rad], rho [kg m^2];
     with ``strength`` also force [N] and speed [m/s] at which the first leg joint saturates.
@@ -90,11 +92,14 @@ def postures(
     shoulder = shoulder[ok]
     com, rho = _com_inertia(m, angles)
     x, z = com.T
-    ok = (z > LOWEST_COM_M) & (x > com_x_m[0]) & (x < com_x_m[1])
+    low, high = (size(robot).of(end, "m") for end in com_x_m)
+    ok = (z > size(robot).of(LOWEST_COM_M, "m")) & (x > low) & (x < high)
     columns = {"angles": angles, "com": com, "shoulder": shoulder, "rho": rho}
     inside = {name: x[ok] for name, x in columns.items()}
     if strength:
-        inside["force"] = 1 / _force_shares(m, inside["angles"], inside["com"]).max(axis=0)
+        least_m = size(robot).of(LEAST_LEVER_M, "m")
+        shares = _force_shares(m, inside["angles"], inside["com"], least_m)
+        inside["force"] = 1 / shares.max(axis=0)
         inside["speed"] = 1 / _speed_shares(m, inside["angles"], inside["com"]).max(axis=0)
     return inside
 
@@ -107,12 +112,16 @@ def _com_inertia(m: SagittalModel, angles: np.ndarray) -> tuple[np.ndarray, np.n
     return com - m.sole_center, m.inertia.sum() + away @ m.mass
 
 
-def _force_shares(m: SagittalModel, angles: np.ndarray, com: np.ndarray) -> np.ndarray:
-    """Shares of ankle, knee, hip (3, n) that a force up takes [1/N], CoP below the CoM."""
+def _force_shares(
+    m: SagittalModel, angles: np.ndarray, com: np.ndarray, least_m: float
+) -> np.ndarray:
+    """Shares of ankle, knee, hip (3, n) that a force up takes [1/N], CoP below the CoM, by levers
+    of at least ``least_m`` [m].
+    """
     turned = np.exp(-1j * angles[:, :3]) * (m.span[:3] @ TO_COMPLEX)
     at = np.cumsum(turned, axis=1).real.T  # of the joints, ahead of the toe
     cop = np.clip(com[:, 0] + m.sole_center[0], m.heel[0], 0.0)
-    levers = np.maximum(np.abs(at - cop), LEAST_LEVER_M)
+    levers = np.maximum(np.abs(at - cop), least_m)
     return levers / (FORCE_SHARE * m.effort[[2, 1, 0], None])
 
 
@@ -135,12 +144,14 @@ def _usual_inertia(p: dict[str, np.ndarray]) -> np.ndarray:
     return np.polyfit(np.linalg.norm(p["com"][easy], axis=1), p["rho"][easy], 2)
 
 
-def _lowest_com(p: dict[str, np.ndarray], quantile: float) -> np.ndarray:
-    """Line z = a x + b, as (a, b), below which only that share of flat-footed postures lies."""
+def _lowest_com(p: dict[str, np.ndarray], edges: np.ndarray, quantile: float) -> np.ndarray:
+    """Line z = a x + b, as (a, b), below which only that share of flat-footed postures lies, in the
+    bins between ``edges`` (n,) [m] that have any.
+    """
     x, z = p["com"].T
-    edges = np.linspace(*FLAT_COM_X_M, COM_BINS + 1)
-    low = [np.quantile(z[(x >= a) & (x < b)], quantile) for a, b in pairwise(edges)]
-    return np.polyfit((edges[1:] + edges[:-1]) / 2, low, 1)
+    bins = {(a + b) / 2: z[(x >= a) & (x < b)] for a, b in pairwise(edges)}
+    low = {middle: np.quantile(z, quantile) for middle, z in bins.items() if len(z)}
+    return np.polyfit([*low], [*low.values()], 1)
 
 
 def _around_stance(lower: np.ndarray, upper: np.ndarray, length: float, inertia: float):
@@ -185,6 +196,7 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     upper = envelope("rho", 1 - EDGE)
     force = envelope("force", 1 - EDGE)
     speed = envelope("speed", SPEED_QUANTILE)
+    bins = size(robot).of(np.linspace(*FLAT_COM_X_M, COM_BINS + 1), "m")
     flat = postures(robot, count, 0.0, FLAT_COM_X_M, strength=False)
     toe = postures(robot, count, TOE_HEEL_UP_RAD, TOE_COM_X_M, strength=False)
     start = rod_of(robot, stance_angles(robot))
@@ -202,8 +214,8 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
         speed_fit=np.polyfit(grid, speed, 3),
         usual_flat_fit=_usual_inertia(flat),
         usual_toe_fit=_usual_inertia(toe),
-        low_com_fit=_lowest_com(flat, LOW_COM_QUANTILE),
-        easy_com_fit=_lowest_com(flat, EASY_COM_QUANTILE),
+        low_com_fit=_lowest_com(flat, bins, LOW_COM_QUANTILE),
+        easy_com_fit=_lowest_com(flat, bins, EASY_COM_QUANTILE),
         inertia=(float(lower.min()), float(upper.max())),
         cop=(float(m.heel[0]) / 2, float(-m.heel[0]) / 2),
         posture=TRUNK_RAD,

@@ -49,13 +49,18 @@ def mirror(model: pin.Model, most_m: float = SAME_M) -> list[tuple[int, int, flo
 
 def in_plane(robot: Robot) -> bool:
     """Whether five links describe a robot: its moving joints are those of legs and swinging arms,
-    those with a role turn about the pitch axis, and left and right are alike."""
+    those with a role turn about the pitch axis, soles are level with joints at 0, and left and
+    right are alike."""
     model = robot.model
     pairs = mirror(model, EXACT_M)
-    in_legs = {j for foot in on_feet(robot, np.zeros(3)) for j in model.supports[foot.joint]}
+    feet = on_feet(robot, np.zeros(3))
+    in_legs = {j for foot in feet for j in model.supports[foot.joint]}
     roles = {name for pair in robot.joints.values() for name in pair}
     free = {model.names[j] for j in range(2, model.njoints) if j not in in_legs} - roles
-    axes = pin.computeJointJacobians(model, model.createData(), pin.neutral(model))[4]
+    data = model.createData()
+    axes = pin.computeJointJacobians(model, data, pin.neutral(model))[4]
+    soles = [data.oMi[foot.joint] * foot.placement for foot in feet]
+    level = max(abs(sole.rotation[2, 0]) for sole in soles) < EXACT_M
     pitch = [axes[model.idx_vs[model.getJointId(name)]] for name in roles]
     try:
         _ = robot.sagittal
@@ -63,7 +68,7 @@ def in_plane(robot: Robot) -> bool:
         return False
     mirrored = len({i for row in pairs for i in row[:2]}) == model.nv - 6
     alike = mirrored and even_masses(model, pairs)
-    return alike and not free and min(np.abs(pitch)) > PARALLEL
+    return alike and level and not free and min(np.abs(pitch)) > PARALLEL
 
 
 def even_masses(model: pin.Model, pairs: list[tuple[int, int, float]]) -> bool:

@@ -15,7 +15,6 @@ from jumplab.robot_import.write import listed
 # None of these numbers is printed by the paper.
 LEANS_RAD = 1.3  # within which a foot is looked for level, in such steps; a shank lies beyond
 STEP_RAD = np.pi / 180
-PITCH = 0.6  # cosine between the axis of an ankle and the lateral one
 STANDS = 0.1  # sine: a cylinder that leans by less than 6 deg stands on its end
 # shares of the leg's length: shapes smaller than this are markers or points, no soles; and what is
 # so little above the lowest point belongs to the sole, at most SOLE_M
@@ -35,12 +34,16 @@ TURN_RAD = np.pi / 6
 
 @dataclass(frozen=True)
 class Sole:
-    """Rectangle along the robot's axes, from the foot link's origin [m], and its source."""
+    """Rectangle along the robot's axes, from the foot link's origin [m], and its source.
+
+    ``level`` is the pitch of the ankle at which it lies level, all other joints at 0 [rad].
+    """
 
     x: tuple[float, float]
     y: tuple[float, float]
     z: float
     source: str
+    level: float = 0.0
 
 
 def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
@@ -60,8 +63,11 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
         return Sole(x, y, leg_m * GUESS_Z, source)
     source = f"from its {' and '.join(sorted(kinds))}"
     least = SMALLEST * leg_m
+    level = 0.0
     if np.ptp(touching[:, 0]) < least:
-        _refuse_lean(tree, foot, turn, leg_m)
+        level = _level(tree, foot, turn, leg_m)
+        turn = pin.rpy.rpyToMatrix(0.0, level, 0.0) @ turn
+        touching, around, _ = sole_points(tree, foot, turn, thickness(leg_m))
     if max(np.ptp(touching[:, :2], axis=0)) < least:
         wide = 1e3 * max(np.ptp(around[:, :2], axis=0))
         raise tree.error(
@@ -74,13 +80,11 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
         points = touching if np.ptp(touching[:, axis]) >= least else around
         ends.append((float(points[:, axis].min()), float(points[:, axis].max())))
         source += ", whose round side counts as level" if points is around else ""
-    return Sole(*ends, float(touching[:, 2].min()), source)
+    return Sole(*ends, float(touching[:, 2].min()), source, level)
 
 
-def _refuse_lean(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> None:
-    """Raise if a foot stands on its heel or toes with all joints at 0, and would be level on more
-    of its length if its ankle turned.
-    """
+def _level(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> float:
+    """Pitch [rad] at which a foot stands on most of its length; 0 if none helps much."""
     _, points, _ = sole_points(tree, foot, turn, np.inf)
     found = {}  # angle -> length that touches [m]
     for angle in sorted(np.arange(-LEANS_RAD, LEANS_RAD, STEP_RAD), key=abs):
@@ -89,17 +93,11 @@ def _refuse_lean(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> None:
         found[angle] = np.ptp(turned[low, 0])
     best = max(found, key=found.get)
     if found[best] <= 3 * SMALLEST * leg_m:
-        return
-    left = turn[1]
-    cosines = {j: left @ tree.pose[j.child].rotation @ j.axis for j in tree.chain(foot) if j.driven}
-    ankle = [joint for joint, cosine in cosines.items() if abs(cosine) > PITCH][-1]
-    by = best * np.sign(cosines[ankle])
-    raise tree.error(
-        f"with all joints at 0 the foot {foot!r} stands on its {'toes' if best < 0 else 'heel'}, "
-        f"{abs(np.degrees(best)):.0f} deg from level, but it must be level; move the zero of joint "
-        f"{ankle.name!r}: turn its frame by {by:.3g} rad about its axis, and shift its range by "
-        f"{-by:.3g}"
-    )
+        return 0.0
+    turned = points @ pin.rpy.rpyToMatrix(0.0, best, 0.0).T
+    ahead = turned[:, 0] > turned[:, 0].min() + np.ptp(turned[:, 0]) / 2
+    heel, toe = (half[np.argmin(half[:, 2])] for half in (turned[~ahead], turned[ahead]))
+    return float(best + np.arctan2(toe[2] - heel[2], toe[0] - heel[0]))
 
 
 def thickness(leg_m: float) -> float:

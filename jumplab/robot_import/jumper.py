@@ -54,6 +54,7 @@ REPAIRS = ("inertia", "massless")
 SOURCE_TABLES = TABLES | {
     "source": ("trunk", "forward", "up", "facing", "repair"),
     "joints": (*TABLES["joints"], "free"),
+    "feet": (*TABLES["feet"], "level_rad"),
     "locked": (),
     "limits": (),
     "assumed": (),
@@ -156,8 +157,8 @@ def _sole(tree: Tree, config: dict, offset: np.ndarray) -> dict[str, float]:
         raise tree.error(
             f"the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
             f"must lie below it and reach to both sides of it: the foot stands on its heel or its "
-            f"toes with all joints at 0, or [feet] is wrong; give the sole in [feet] along level "
-            f"axes"
+            f"toes, or [feet] is wrong; give the sole there along level axes, and level_rad, the "
+            f"ankles' pitch at which these are level"
         )
     return {"heel": float(x[0]), "toe": float(x[1]), "half": float(half), "z": float(z)}
 
@@ -205,7 +206,8 @@ def _urdf(name: str, lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes])
     _add_trunk(robot, trunk, boxes[trunk.name], hip - trunk.place)
     for body in others:
         _add_body(robot, body.name, body.inertia, boxes[body.name])
-        place = shifted(body.place - lumped.bodies[body.parent].place)
+        turn = pin.exp3(-body.level * body.axis)
+        place = pin.SE3(turn, body.place - lumped.bodies[body.parent].place)
         limits = {key: body.limits[key] for key in LIMITS}
         ends = body.parent, body.name
         add_joint(robot, body.joint, "revolute", ends, place, body.axis, limits)

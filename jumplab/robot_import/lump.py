@@ -18,7 +18,7 @@ from jumplab.errors import RobotError
 from jumplab.robot.files import LEG, entry, table
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.roles import leg_joints, robot_axes
-from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Tree, link_poses, links_of
+from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Joint, Tree, link_poses, links_of
 from jumplab.robot_import.write import key, listed, shifted
 
 RoleJoints = dict[str, tuple[str, ...]]
@@ -58,6 +58,7 @@ class Body:
     # lower, upper [rad], effort [N m], velocity [rad/s]; of MOTOR what is known
     limits: dict[str, float]
     inertia: pin.Inertia  # about ``place``, in the robot's axes
+    level: float = 0.0  # angle of its joint [rad] at which it is as described here
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Lumped:
     changed: dict[str, tuple[float, str]]
     held: dict[str, float]  # joint -> angle [rad] of the joints that no longer move
     links: dict[str, str]  # link of the URDF -> body it belongs to
-    # link -> its place in the robot's axes, those joints held and all others at 0
+    # link -> its place in the robot's axes, those joints held, soles level and all others at 0
     placed: dict[str, pin.SE3]
 
     @property
@@ -122,8 +123,9 @@ def lump(
             f"the trunk faces {source['forward']}; turn all pairs round by [source] facing, or "
             f"correct [joints]"
         )
-    middle = np.array([0.0, (hips[0][1] + hips[1][1]) / 2, 0.0])
-    model.jointPlacements[1] = pin.SE3(turn, -middle)
+    middle = _between_legs(tree, trunk, feet, pose, turn[1])
+    model.jointPlacements[1] = pin.SE3(turn, np.array([0.0, -middle, 0.0]))
+    levels = _levelled(tree, config, roles, model)
     placed = link_poses(model)
     edges = entry(config, "feet", "sole_y_m", count=2)
     changed = {}
@@ -136,9 +138,42 @@ def lump(
             f"give its link a mass, or name another [source] trunk"
         )
     _check_ranges(tree, bodies, roles)
+    bodies = [replace(body, level=levels.get(body.joint, 0.0)) for body in bodies]
     bodies = _with_mass(bodies, changed)
     bodies = _mirrored(bodies, changed)
     return Lumped({b.name: b for b in bodies}, changed, held, links, placed)
+
+
+def _between_legs(
+    tree: Tree, trunk: str, feet: Sequence[str], pose: dict[str, pin.SE3], left: np.ndarray
+) -> float:
+    """Place of the plane between the legs, along the axis ``left`` (3,) [m].
+
+    It lies amid the first two joints whose axes turn least about that one: along its axis, an
+    origin may lie anywhere.
+    """
+    legs = ([j for j in tree.path_between(trunk, foot) if j.driven] for foot in feet)
+
+    def turning(pair: tuple[Joint, ...]) -> float:
+        return round(abs(left @ pose[pair[0].child].rotation @ pair[0].axis), 2)
+
+    pair = min(zip(*legs, strict=False), key=turning)
+    return float(sum(left @ pose[joint.child].translation for joint in pair) / 2)
+
+
+def _levelled(tree: Tree, config: dict, roles: RoleJoints, model: pin.Model) -> dict[str, float]:
+    """Angles of the ankles [rad] at which the soles are level, which are 0 in ``model`` afterwards;
+    {} if they are 0 in the file.
+    """
+    pitch = entry(config, "feet", "level_rad", default=0.0)
+    axes = pin.computeJointJacobians(model, model.createData(), pin.neutral(model))[3:].T
+    out = {}
+    for name in roles["ankle_pitch"] if pitch else ():
+        joint = model.getJointId(name)
+        out[name] = float(pitch * np.sign(axes[model.idx_vs[joint], 1]))
+        turned = pin.exp3(out[name] * tree.joints[name].axis)
+        model.jointPlacements[joint] = model.jointPlacements[joint] * pin.SE3(turned, np.zeros(3))
+    return out
 
 
 # what moves, and how far
@@ -332,7 +367,8 @@ def _bodies(
     """The trunk, then outwards a body for each joint of ``limits``, and the body of each link; all
     their mass must hang on the trunk.
 
-    The middle of the left sole is ``beside`` [m] the origin of its link, to the left.
+    The middle of the left sole is ``beside`` [m] the origin of its link, to the left; that of the
+    right one is opposite.
     """
     data = model.createData()
     axes = pin.computeJointJacobians(model, data, pin.neutral(model))[3:].T
@@ -353,8 +389,8 @@ def _bodies(
             axis = _snapped(sign * axes[model.idx_vs[turning]])
         # an origin may lie anywhere on its axis: in the middle of the sole
         if name in feet and abs(axis[1]) == 1:
-            middle = placed[name].translation[1] + (beside if name == feet[0] else -beside)
-            place = np.array([place[0], middle, place[2]])
+            middle = placed[feet[0]].translation[1] + beside
+            place = np.array([place[0], middle if name == feet[0] else -middle, place[2]])
         inertia = (shifted(-place) * data.oMi[carrier]).act(model.inertias[carrier])
         bodies.append(Body(name, parent, joint, place, axis, limits.get(joint, {}), inertia))
         names[carrier] = name

@@ -36,7 +36,7 @@ TIES = [*map(int, (EQUALITY.mjEQ_CONNECT, EQUALITY.mjEQ_WELD))]  # of bodies: cl
 PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT))]
 LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
 UNNAMED = "MuJoCo Model"
-MOST_MESHES = 30  # of which hulls are made in a second
+MOST_MESHES = 5  # of which hulls are made in half a second; MuJoCo lets nothing else run then
 MOST_TOES = 2  # joints that hang on a foot
 FOOT_HEIGHT = 0.35  # of a robot's, over its lowest body, up to which a foot may be
 # elements of settings, in which an attribute that another MuJoCo knows is no part of the robot

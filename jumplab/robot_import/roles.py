@@ -511,6 +511,8 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
         joints="\n".join(f"{role} = {quote(roles.joints[role])}" for role in ROLES),
         feet=quote(roles.feet),
         sole=sole,
+        level=f"level_rad = {sole.level:.4g}  # of the ankles, about the axis to the left\n"
+        * bool(sole.level),
         trunk_link=quote(roles.trunk),
         other=roles.forward.translate(str.maketrans("+-", "-+")),
         knee=_inside(tree, turn[1], roles.joints["knee"], STANCE_KNEE_RAD),

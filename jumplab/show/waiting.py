@@ -21,8 +21,9 @@ WIDTH = 110  # a longer line would wrap on most terminals
 
 
 @contextlib.contextmanager
-def waiting(out: TextIO, head: str = "") -> Iterator[None]:
-    """Within the block, what long work says of itself is a line of ``out``, gone at the end.
+def waiting(out: TextIO, head: str = "", first: str = "") -> Iterator[None]:
+    """Within the block, what long work says of itself is a line of ``out``, gone at the end;
+    ``first`` is there before it says anything.
 
     A thread of its own keeps it up to date: a solve, or a robot's meshes, say nothing for long.
     """
@@ -39,6 +40,8 @@ def waiting(out: TextIO, head: str = "") -> Iterator[None]:
             bar.set_description_str(head + ", ".join(words), refresh=False)
             bar.update(0)
 
+        if first:
+            hear(first, 0, 0)
         ended = threading.Event()
 
         def keep() -> None:
@@ -59,7 +62,9 @@ def waiting(out: TextIO, head: str = "") -> Iterator[None]:
 def on_terminal(command: str) -> contextlib.AbstractContextManager:
     """Show the progress of a ``command`` on stderr, if that is a terminal."""
     out = sys.stderr
-    return waiting(out, f"jumplab {command}: ") if out.isatty() else contextlib.nullcontext()
+    if not out.isatty():
+        return contextlib.nullcontext()
+    return waiting(out, f"jumplab {command}: ", "loading")  # imports take seconds on busy machines
 
 
 class _UnderCell:
