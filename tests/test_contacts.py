@@ -247,3 +247,15 @@ def test_refused(make, sentence):
     with pytest.raises(InputError) as e:
         make()
     assert str(e.value) == sentence
+
+
+def test_eased_there_is_less_to_do():
+    robot = Robot.load("bhr")
+    off = Contacts.step_off(robot, 0.3)
+    lower = off.eased(1 / 3)
+    assert [p.up_m for p in lower.places] == pytest.approx([-0.1, -0.1])
+    assert [p.ahead_m for p in lower.places] == [p.ahead_m for p in off.places]  # the edge stays where it is
+    hop = Contacts.hop(robot, 0.3)
+    assert [p.ahead_m for p in hop.eased(2 / 3).places] == pytest.approx([0.2, 0.2])
+    assert hop.eased(1.0) == hop and off.eased(1.0) == off
+    assert lower.phases == off.phases

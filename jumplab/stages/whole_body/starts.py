@@ -173,12 +173,13 @@ def from_straight(program: Program, asked: Asked) -> Beginning:
 
 def from_eased(program: Program, asked: Asked) -> Beginning:
     """The schedule with less to do (see :meth:`.Contacts.eased`), then with ever more."""
-    first, *further = EASED
-    easy = replace(program, contacts=program.contacts.eased(first))
-    solved = easy.solve_apart(asked, COLD[0])
-    for share in further:
+    start = COLD[0]
+    for share in EASED:
         easy = replace(program, contacts=program.contacts.eased(share))
-        solved = easy.solve_apart(replace(asked, near=solved), FROM_NEIGHBOUR[0])
+        named = replace(start, name=f"{100 * share:.0f} % of the schedule")
+        solved = easy.solve_apart(asked, named)
+        asked = replace(asked, near=solved)
+        start = FROM_NEIGHBOUR[0]
     return from_solved(program, solved)
 
 
@@ -230,11 +231,7 @@ RAMPED = QUICK | {"mu_init": 1e-2, "mu_min": 1e-4}
 ASIDE = (Start("ramp", from_straight, True, 150, RAMPED), *COLD)
 # shares of a schedule, solved one after the other, each from the one before
 EASED = 1 / 3, 2 / 3
-SCHEDULED = (
-    COLD[0],
-    Start("schedule with less to do", from_eased, True, 100, NEAR),
-    *COLD[1:],
-)
+SCHEDULED = (Start("eased schedule", from_eased, True, 100, NEAR), *COLD)
 # in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is
 # tried soon
 IN_PLANE = (replace(COLD[0], patience=50), *COLD[1:])
