@@ -159,13 +159,13 @@ class Weights:
     track_duration: float = 50.0  # [1] / [s]^2
 
     # where a given motion is followed
-    follow_joints: float = 50.0  # [1] / [rad]^2 / [s]
+    follow_joints: float = 60.0  # [1] / [rad]^2 / [s]
     follow_base: float = 100.0  # [1] / [m]^2 / [s]
     follow_attitude: float = 60.0  # [1] / [rad]^2 / [s]
     follow_takeoff: float = 0.0  # [1] / [m/s]^2, of the vertical speed that a target's rise needs
     follow_duration: float = 100.0  # [1], of the share by which a phase is longer or shorter
-    # [1] / [m, rad]^2; with a fortieth of it feet are shuffled instead of jumped
-    follow_foothold: float = 1200.0
+    # [1] / [m, rad]^2; with an eightieth of it feet are shuffled instead of jumped
+    follow_foothold: float = 2000.0
 
     def of_clip(self) -> Weights:
         """The same for a motion that follows another one: what it costs counts less."""

@@ -228,8 +228,6 @@ GIVEN = (
     Start(MENDED, from_mended, True, 60),
     Start(MENDED, from_mended, False, 150),
 )
-# the barrier from far off down, step by step; adaptive, a record ends sooner, and lower
-FAR_OFF = {"mu_init": 0.1, "mu_strategy": "monotone"}
 # of a motion that is followed: near it the exact Hessian settles, the held one wanders. Links that
 # meet move it further, so it ends roughly, where they are seen, and is solved on with their rows
 ROUGH = {
@@ -237,7 +235,7 @@ ROUGH = {
     "acceptable_compl_inf_tol": 0.3,
     "acceptable_obj_change_tol": 3e-2,
 }
-FOLLOWED = (Start("given motion", from_motion, False, 120, QUICK | ROUGH | FAR_OFF),)
+FOLLOWED = (Start("given motion", from_motion, False, 120, QUICK | ROUGH),)
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, from_neighbour, True, 100, NEAR),
     Start(NEIGHBOUR, from_neighbour, False, 150, WARM | {"acceptable_iter": 1}),
@@ -249,12 +247,14 @@ APART = (
     Start("links apart", from_neighbour, False, 120, MET),
 )
 # from a rough solution, further inside the limits with a higher barrier; then from what came of it
+STEPPED = MET | {"mu_strategy": "monotone"}
 AFTER_ROUGH = tuple(
-    Start("links apart", from_neighbour, False, 120, MET | warm(push) | FAR_OFF | {"mu_init": mu})
+    Start("links apart", from_neighbour, False, 120, STEPPED | warm(push) | {"mu_init": mu})
     for push, mu in ((1e-3, 3e-3), (1e-4, 3e-4))
 )
 # to a record from an easy jump: to the end, or its prices would be rounding
 EXACT = {"acceptable_iter": 0, "tol": 1e-4}
+FAR_OFF = {"mu_init": 0.1, "mu_strategy": "monotone"}  # adaptive, it ends sooner, and lower
 SEEKING = Start("easy jump", from_neighbour, False, 300, WARM | EXACT | FAR_OFF)
 RECORD = Start("record", from_neighbour, False, 150, WARM | EXACT | {"mu_init": 1e-4})
 SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
