@@ -159,7 +159,7 @@ class Weights:
     track_duration: float = 50.0  # [1] / [s]^2
 
     # where a given motion is followed
-    follow_joints: float = 60.0  # [1] / [rad]^2 / [s]
+    follow_joints: float = 50.0  # [1] / [rad]^2 / [s]
     follow_base: float = 100.0  # [1] / [m]^2 / [s]
     follow_attitude: float = 60.0  # [1] / [rad]^2 / [s]
     follow_takeoff: float = 0.0  # [1] / [m/s]^2, of the vertical speed that a target's rise needs
