@@ -320,6 +320,16 @@ def test_a_good_status_with_wrong_rows_is_not_believed(status):
         assert e.value.status == status
 
 
+def test_a_rough_solution_is_for_who_asks_for_one():
+    nlp = Nlp(move()).with_options({"acceptable_constr_viol_tol": 1e-2})
+    sound = nlp.solver
+    nlp.solver = Pretender(sound, GOOD_STATUSES[-1], 1e-3)
+    assert 1e-4 < nlp.solve({"goal": 1.0}, flat_guess()).statistics.residual < 1e-2
+    nlp.solver = Pretender(sound, GOOD_STATUSES[-1], 0.1)
+    with pytest.raises(SolverError):
+        nlp.solve({"goal": 1.0}, flat_guess())
+
+
 def test_errors_carry_their_story():
     error = SolverError("no", stage="a", status="b", violations=("c",))
     assert (error.stage, error.status, error.violations, error.exit_code) == ("a", "b", ("c",), 3)

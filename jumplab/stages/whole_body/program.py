@@ -31,7 +31,14 @@ from jumplab.stages.whole_body.motions import Motion
 from jumplab.stages.whole_body.problem import SOUGHT, Schedule
 from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
-from jumplab.stages.whole_body.starts import APART, Asked, Beginning, Start, from_solved
+from jumplab.stages.whole_body.starts import (
+    AFTER_ROUGH,
+    APART,
+    Asked,
+    Beginning,
+    Start,
+    from_solved,
+)
 from jumplab.task import RANGES, JumpTask
 
 # beyond, the cost moves by less than one in a million
@@ -213,18 +220,19 @@ class Program(Shown):
 
     def solve_apart(self, asked: Asked, start: Start) -> Solved:
         """The same, solved on with rows for whatever links meet in it (at most :data:`ROUNDS`
-        times).
+        times); a rough solution in any case.
         """
         solved = self.solve(asked, start)
         held = start.held
-        for _ in range(ROUNDS):
+        for number in range(ROUNDS):
             begin = from_solved(self, solved)
             rows = merged(begin.apart, self._met(solved))
-            if rows == begin.apart:
+            if rows == begin.apart and (number or not start.rough):
                 break
             begin = replace(begin, apart=rows)
+            again = AFTER_ROUGH[min(number, 1)] if start.rough else APART[not held]
             try:
-                solved = self.solve(asked, APART[not held], begin)
+                solved = self.solve(asked, again, begin)
             except SolverError:
                 if not held or self.left_s(asked) <= 0:
                     raise

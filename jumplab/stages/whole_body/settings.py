@@ -164,8 +164,8 @@ class Weights:
     follow_attitude: float = 60.0  # [1] / [rad]^2 / [s]
     follow_takeoff: float = 0.0  # [1] / [m/s]^2, of the vertical speed that a target's rise needs
     follow_duration: float = 100.0  # [1], of the share by which a phase is longer or shorter
-    # [1] / [m, rad]^2; with a fortieth of it feet are shuffled instead of jumped
-    follow_foothold: float = 1200.0
+    # [1] / [m, rad]^2; with an eightieth of it feet are shuffled instead of jumped
+    follow_foothold: float = 2000.0
 
     def of_clip(self) -> Weights:
         """The same for a motion that follows another one: what it costs counts less."""

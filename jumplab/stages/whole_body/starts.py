@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumplab.ocp.nlp import WARM
+from jumplab.ocp.nlp import WARM, warm
 from jumplab.ocp.solution import Multipliers, PhaseGuess
 from jumplab.stages.whole_body.motions import Motion, guess, mended, ramped, reached, still
 from jumplab.stages.whole_body.shapes import Apart
@@ -120,6 +120,11 @@ class Start:
     def hessian(self) -> str:
         """The Hessian in words."""
         return "held Gauss-Newton" if self.held else "exact"
+
+    @property
+    def rough(self) -> bool:
+        """Whether it ends before its rows are met, so that another solve has to follow."""
+        return "acceptable_constr_viol_tol" in self.options
 
 
 def from_schedule(program: Program, asked: Asked, **drawn: float) -> Beginning:
@@ -241,11 +246,14 @@ GIVEN = (
     Start(MENDED, from_mended, True, 60),
     Start(MENDED, from_mended, False, 150),
 )
-# of a motion that is followed: near it the exact Hessian settles, the held one wanders; links that
-# meet move it further, so it need not be exact before
-FOLLOWED = (
-    Start("given motion", from_motion, False, 120, QUICK | {"acceptable_obj_change_tol": 5e-3}),
-)
+# of a motion that is followed: near it the exact Hessian settles, the held one wanders. Links that
+# meet move it further, so it ends roughly, where they are seen, and is solved on with their rows
+ROUGH = {
+    "acceptable_constr_viol_tol": 1e-2,
+    "acceptable_compl_inf_tol": 0.3,
+    "acceptable_obj_change_tol": 3e-2,
+}
+FOLLOWED = (Start("given motion", from_motion, False, 120, QUICK | ROUGH),)
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, from_neighbour, True, 100, NEAR),
     Start(NEIGHBOUR, from_neighbour, False, 150, WARM | {"acceptable_iter": 1}),
@@ -255,6 +263,12 @@ MET = WARM | {"acceptable_iter": 1, "mu_init": 1e-3}
 APART = (
     Start("links apart", from_neighbour, True, 80, MET),
     Start("links apart", from_neighbour, False, 120, MET),
+)
+# from a rough solution, further inside the limits with a higher barrier; then from what came of it
+STEPPED = MET | {"mu_strategy": "monotone"}
+AFTER_ROUGH = tuple(
+    Start("links apart", from_neighbour, False, 120, STEPPED | warm(push) | {"mu_init": mu})
+    for push, mu in ((1e-3, 3e-3), (1e-4, 3e-4))
 )
 # to a record from an easy jump: to the end, or its prices would be rounding
 EXACT = {"acceptable_iter": 0, "tol": 1e-4}
