@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumplab.ocp.nlp import WARM, warm
+from jumplab.ocp.nlp import RESIDUAL_LIMIT, WARM, warm
 from jumplab.ocp.solution import Multipliers, PhaseGuess
 from jumplab.stages.whole_body.motions import Motion, guess, mended, ramped, reached, still
 from jumplab.stages.whole_body.shapes import Apart
@@ -124,7 +124,7 @@ class Start:
     @property
     def rough(self) -> bool:
         """Whether it ends before its rows are met, so that another solve has to follow."""
-        return "acceptable_constr_viol_tol" in self.options
+        return self.options.get("acceptable_constr_viol_tol", 0.0) > RESIDUAL_LIMIT
 
 
 def from_schedule(program: Program, asked: Asked, **drawn: float) -> Beginning:
