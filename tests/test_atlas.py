@@ -12,7 +12,7 @@ from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_angles
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import WholeBodyPlanner
-from jumplab.stages.whole_body.program import IPOPT
+from jumplab.stages.whole_body.starts import NEAR
 from jumplab.studies.atlas import Atlas, key_of_plans
 from jumplab.studies.atlas import node_row as row_of
 from jumplab.studies.envelope import envelope
@@ -60,7 +60,7 @@ def test_a_target_between_nodes_is_a_few_steps_away(place):
     task = JumpTask(*place)
     plan = planner().plan(task, "direct")
     cold = planner().stage("direct").plan(task)
-    s, most = plan.whole_body.solution.statistics, IPOPT["acceptable_constr_viol_tol"]
+    s, most = plan.whole_body.solution.statistics, NEAR["acceptable_constr_viol_tol"]
     assert [x.start for x in plan.attempts] == ["neighbour"] and s.residual <= most
     assert 2 * s.iterations <= sum(x.iterations for x in cold.attempts)
     assert audit(plan.tape, plan.robot, task).passed
