@@ -118,7 +118,8 @@ def test_start_is_the_stance(bhr, planner, printed):
     first = one(printed.motion, 0)
     q = full_state(bhr, *(first[name] for name in MOTION))[0]
     np.testing.assert_allclose(q, stance_configuration(bhr), atol=1e-9)
-    assert not np.any(first["rates"]) and not np.any(first["toe_velocity"])
+    # slopes of the polynomial at its ends are rounded
+    assert max(np.abs(first["rates"]).max(), np.abs(first["toe_velocity"]).max()) < 1e-12
 
 
 # rows -----------------------------------------------------------------------------------------------------------
