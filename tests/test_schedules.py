@@ -43,7 +43,7 @@ def test_a_hop_follows_its_schedule():
 
 def test_its_attempts_say_what_was_tried():
     plan = hop()
-    assert plan.attempts[0].start == "schedule" and plan.attempts[-1].status.startswith("Solve")
+    assert plan.attempts[0].start == "33 % of the schedule" and plan.attempts[-1].status.startswith("Solve")
     assert all(x.iterations > 0 and x.cpu_s > 0 for x in plan.attempts)
     assert len(plan.statistics) == len(plan.attempts)
     assert plan.summary["attempts"][0]["hessian"] == "held Gauss-Newton"

@@ -40,6 +40,7 @@ from jumplab.stages.whole_body.starts import (
     REFINED,
     SCHEDULED,
     SETTLED,
+    SHORT,
     STANCE,
     Asked,
     Attempt,
@@ -271,7 +272,7 @@ class WholeBodyPlanner:
         ramp = aside and not turns and asked.straight is not None
         cold = IN_PLANE if program.free.plane else ASIDE if ramp else COLD
         if self.contacts.ends == "rest":
-            cold = SCHEDULED
+            cold = SCHEDULED[len(self.contacts.phases) <= SHORT]
         near = FROM_NEIGHBOUR if asked.near is not None else ()
         given = GIVEN if asked.motion is not None else ()
         if task.rotation_rad:  # a body that turns over has no places for its feet

@@ -236,11 +236,9 @@ RAMPED = QUICK | {"mu_init": 1e-2, "mu_min": 1e-4}
 ASIDE = (Start("ramp", from_straight, True, 150, RAMPED), *COLD)
 # shares of a schedule, solved one after the other, each from the one before
 EASED = 1 / 3, 2 / 3
-SCHEDULED = (
-    replace(COLD[0], patience=100),
-    Start("eased schedule", from_eased, True, 100, NEAR),
-    *COLD[1:],
-)
+LESS = Start("eased schedule", from_eased, True, 100, NEAR)
+SHORT = 5  # phases, up to which three solves take less time than one that wanders
+SCHEDULED = {True: (LESS, *COLD), False: (replace(COLD[0], patience=100), LESS, *COLD[1:])}
 # in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is
 # tried soon
 IN_PLANE = (replace(COLD[0], patience=50), *COLD[1:])
