@@ -104,8 +104,8 @@ class WholeBody:
         ground's ``corners``, see :func:`corner_rows`.
 
         ``moment`` (3,) about the CoM is needed besides, by a load that the model lacks [N m].
-        Joints that are ``leaning`` (nv - 6,) on a stop come to rest on it within :data:`REST_S`; the
-        stop adds to the torques of their motors.
+        Joints that are ``leaning`` (nv - 6,) on a stop come to rest on it within :data:`REST_S`;
+        the stop adds to the torques of their motors.
         """
         offset = self._offset.copy()
         if moment is not None:
