@@ -41,6 +41,21 @@ def test_a_hop_follows_its_schedule():
     assert np.abs(plan.tape.v[[0, -1]]).max() < 1e-3
 
 
+def test_an_edge_lies_across_the_way_ahead():
+    """For planner, audit and simulation, though the feet come down to the left of it."""
+    robot = jl.Robot.load("bhr")
+    off = jl.Contacts.step_off(robot, 0.1)
+    aside = replace(off, places=tuple(replace(place, left_m=0.06) for place in off.places))
+    plan = jl.plan(robot=robot, contacts=aside)
+    assert plan.planned_side_m > 0.009
+    r = replay(plan.tape, robot, plan.task, plan.summary["platform_edge_m"])
+    scene = jl.Scene.of_plan(plan.summary, robot)
+    assert r.course_rad == scene.along_rad == 0
+    toes = robot.foot.toe - robot.foot.center[0]
+    assert r.edge == pytest.approx(plan.whole_body.edge_m + toes, abs=1e-6)
+    assert plan.audit.passed, plan.audit.table()
+
+
 def test_its_attempts_say_what_was_tried():
     plan = hop()
     assert plan.attempts[0].start == "33 % of the schedule" and plan.attempts[-1].status.startswith("Solve")

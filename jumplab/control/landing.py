@@ -31,12 +31,11 @@ SOLE_SHARE = 0.95, 0.5
 PLANNED_FRICTION = 0.45  # below the lowest floor friction of the perturbed trials, 0.5
 STOP_MARGIN_RAD = 0.05  # a stop is respected this far before it
 STOP_HORIZON_S = 0.05  # a joint that would reach it within this time is turned back ...
-# a joint so close to its stop, whose motor has less to give than this, leans on it: the stop bears
-# the rest. Otherwise a trunk on the stop of a weak waist is believed to fall, and the pelvis sent
-# after it
-TOUCH_RAD = 0.02
-SPENT_N_M = 1e-3
 STOP_LEAVE = 10.0  # [rad/s^2] ... and if it is wished elsewhere, at least so much
+# so close to its stop, a joint whose motor gives all but this leans on it: the stop bears the rest.
+# Otherwise a trunk on the stop of a weak waist is believed to fall, and the pelvis is sent after it
+TOUCH_RAD = 0.02
+SPENT_N_M = 1e-3  # of a robot of the default one's size
 # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
 MAX_SHIFT = 60.0
 MAX_TURN = 300.0

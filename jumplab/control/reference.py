@@ -113,8 +113,8 @@ class LandingAhead:
                 now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate
             ) > self._size.of(OFF_M, "m"):
                 plan, _, spent_s = self._solve(now)
-                # from here stage 1 may know no landing; the older one is the best there is then,
-                # and it is not asked again of a robot that falls: each refusal takes seconds
+                # from here stage 1 may know no landing; the older one is the best there is then.
+                # It is not asked again: a refusal takes seconds
                 self._next = plan and replace(plan, t=plan.t + time)  # since touchdown
                 self._due = self._due if plan else np.inf
                 self.again["made" if plan else "refused"] += 1

@@ -466,12 +466,14 @@ class Planner(Shown):
         last = self._whole_body(contacts=contacts, **settings)
         body = last.plan(level, weights=asked.weights, **options)
         found = planned(body.tape)
+        height, _ = contacts.surface
         task = JumpTask(
             found["planned_distance_m"],
             max(LEAST_RISE_M, found["planned_rise_m"]),
-            contacts.surface[0],
+            height,
             gravity=gravity,
-            side_m=found["planned_side_m"],
+            # an edge lies across the way ahead, whatever the feet do beside it
+            side_m=0.0 if height else found["planned_side_m"],
             yaw_rad=found["planned_yaw_rad"],
         )
         return JumpPlan.of(self.robot, "direct", replace(body, task=task), contacts=contacts)

@@ -35,12 +35,13 @@ from jumplab.stages.whole_body.starts import (
     FROM_NEIGHBOUR,
     GIVEN,
     IN_PLANE,
+    LONG_SCHEDULE,
     MENDED,
     NEIGHBOUR,
     REFINED,
-    SCHEDULED,
     SETTLED,
     SHORT,
+    SHORT_SCHEDULE,
     STANCE,
     Asked,
     Attempt,
@@ -272,7 +273,7 @@ class WholeBodyPlanner:
         ramp = aside and not turns and asked.straight is not None
         cold = IN_PLANE if program.free.plane else ASIDE if ramp else COLD
         if self.contacts.ends == "rest":
-            cold = SCHEDULED[len(self.contacts.phases) <= SHORT]
+            cold = SHORT_SCHEDULE if len(self.contacts.phases) <= SHORT else LONG_SCHEDULE
         near = FROM_NEIGHBOUR if asked.near is not None else ()
         given = GIVEN if asked.motion is not None else ()
         if task.rotation_rad:  # a body that turns over has no places for its feet

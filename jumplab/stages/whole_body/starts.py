@@ -238,7 +238,8 @@ ASIDE = (Start("ramp", from_straight, True, 150, RAMPED), *COLD)
 EASED = 1 / 3, 2 / 3
 LESS = Start("eased schedule", from_eased, True, 100, NEAR)
 SHORT = 5  # phases, up to which three solves take less time than one that wanders
-SCHEDULED = {True: (LESS, *COLD), False: (replace(COLD[0], patience=100), LESS, *COLD[1:])}
+SHORT_SCHEDULE = (LESS, *COLD)
+LONG_SCHEDULE = (replace(COLD[0], patience=100), LESS, *COLD[1:])
 # in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is
 # tried soon
 IN_PLANE = (replace(COLD[0], patience=50), *COLD[1:])
