@@ -74,7 +74,7 @@ class Controller:
     mode : "position", "pd" or "whole-body", the servo that plays the tape until touchdown, see
         :mod:`.servo`; after it, a landing in torque mode.
     reaim : put the legs in the air to where they can catch the robot, see :class:`.reaim.Reaim`.
-    step : allow one recovery step after touchdown, see :class:`.step.RecoveryStep`.
+    step : allow recovery steps after touchdown, see :class:`.step.RecoveryStep`.
     feedback : let the joints leave the tape on the ground, so that the body as a whole moves as
         planned, see :class:`.launch.LaunchFeedback`. Not in mode "pd". If None, where the tape
         stands on one foot: what is wrong there tips the robot.
@@ -157,9 +157,9 @@ class Controller:
         return self.landing.solver.solves, self.landing.solver.failures
 
     @property
-    def stepped_s(self) -> float | None:
-        """When a recovery step began, since the touchdown [s]; None if none did."""
-        return self.landing.step.began_s
+    def steps_s(self) -> tuple[float, ...]:
+        """When recovery steps began, since the touchdown [s]."""
+        return tuple(self.landing.step.starts_s)
 
     def to_json(self) -> dict:
         """Settings of this controller, for the settings of a result."""

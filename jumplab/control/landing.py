@@ -93,9 +93,9 @@ class LandingController:
 
     ``robot`` is as planned: the controller knows no perturbation. Without a
     ``reference``, spring-dampers lead to the middle of the feet at standing height. ``solver``
-    counts the QPs posed and those without a solution. With ``may_step`` it takes one ``step`` where
-    its feet alone cannot catch the robot; what was planned ends there. Forces of the feet err by
-    ``force_noise_n`` [N] each.
+    counts the QPs posed and those without a solution. With ``may_step`` it takes a ``step``
+    wherever its feet alone cannot catch the robot; what was planned ends there. Forces of the feet
+    err by ``force_noise_n`` [N] each.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class LandingController:
         body.update(q, v)
         if self._may_step:
             self.step.look(time, body, foot_force)
-        if self.step.began_s is not None:
+        if self.step.starts_s:
             self.reference = None
         contact = self.standing(time, foot_force)
         body.set_contact(contact)

@@ -1,4 +1,4 @@
-"""One recovery step: a foot is put to where the robot would come to rest, once that lies beyond
+"""Recovery steps: a foot is put to where the robot would come to rest, once that lies beyond
 both soles.
 
 On soles that stand, a pendulum of the CoM's height z comes to rest over the capture point x + v
@@ -16,7 +16,7 @@ from jumplab.control.estimator import SURE
 from jumplab.robot import Robot
 from jumplab.robot.legs import size
 
-SETTLED_S = 0.15  # after touchdown; before, the soles turn flat and the impact is not over
+SETTLED_S = 0.15  # after a foot came down; before, soles turn flat and the impact is not over
 # the capture point this far beyond the soles, for so long
 BEYOND_M = 0.01
 BEYOND_S = 0.02
@@ -34,7 +34,7 @@ LEAST_HEIGHT_M = 0.1  # of the pendulum
 
 
 class RecoveryStep:
-    """Decides on the step, and where the foot is to be until it stands again; takes no second one.
+    """Decides on each step, and where the foot is to be until it stands again.
 
     ``usable`` is the share of the sole's length and width in which the pressure is wished: beyond
     that part of both soles it steps. Forces of the feet err by ``force_noise_n`` [N] each. The
@@ -43,7 +43,7 @@ class RecoveryStep:
     Attributes
     ----------
     side : the foot in the air, 0 left, 1 right, None if both stand.
-    began_s : when it left, since touchdown; None before the step.
+    starts_s : when feet left, since touchdown, one time per step.
     """
 
     def __init__(self, robot: Robot, usable: tuple[float, float], force_noise_n: float = 0.0):
@@ -54,34 +54,38 @@ class RecoveryStep:
         self._swing_s = large.of(SWING_S, "s")
         self._least_s = large.of(LEAST_S, "s")
         self.side: int | None = None
-        self.began_s: float | None = None
+        self.starts_s: list[float] = []
         self._half = np.array([(foot.toe - foot.heel) / 2, foot.half_width]) * usable
         self._corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * self._half
         self._beyond_since = np.inf
+        self._settled_s = large.of(SETTLED_S, "s")
+        self._from_s = self._settled_s
         self.goal = np.zeros(3)
 
     def look(self, time: float, body: WholeBody, foot_force: np.ndarray) -> None:
         """Begin, aim or end the step: ``time`` since touchdown, state in ``body``, vertical forces
         (2,) of the feet.
         """
-        if self.began_s is None and self._needed(time, body, foot_force):
-            self.began_s = time
+        if self.side is None and self._needed(time, body, foot_force):
+            self.starts_s.append(time)
+            self._beyond_since = np.inf
             self.side = int(
                 np.argmin([self._foothold(body, side, self._swing_s)[1] for side in (0, 1)])
             )
         if self.side is None:
             return
-        gone = time - self.began_s
+        gone = time - self.starts_s[-1]
         if gone > self._swing_s or (
             gone > self._swing_s / 2 and foot_force[self.side] > self._met_n
         ):
             self.side = None
+            self._from_s = time + self._settled_s
         elif gone < self._swing_s - self._least_s:
             self.goal = self._foothold(body, self.side, self._swing_s - gone)[0]
 
     def _needed(self, time: float, body: WholeBody, foot_force: np.ndarray) -> bool:
         beyond = False
-        if time > body.size.of(SETTLED_S, "s") and (foot_force > 0).any():
+        if time > self._from_s and (foot_force > 0).any():
             turned = self._corners @ body.attitudes[:, :2, :2].transpose(0, 2, 1)
             corners = (body.soles[:, None, :2] + turned).reshape(-1, 2)
             beyond = beyond_hull(_capture_point(body), corners) > body.size.of(BEYOND_M, "m")
@@ -126,7 +130,7 @@ class RecoveryStep:
         """
         place = body.soles[self.side]
         speed = body.twists[self.side][:3]
-        gone = time - self.began_s
+        gone = time - self.starts_s[-1]
         left = max(self._swing_s - gone, self._least_s)
         half = self._swing_s / 2 - gone
         wish = 6 * (self.goal - place) / left**2 - 4 * speed / left

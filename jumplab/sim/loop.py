@@ -233,7 +233,9 @@ def simulate_jump(
         disturbance=disturbance and asdict(disturbance),
         **controller.to_json(),
     )
-    return replace(result, metrics=replace(result.metrics, recovery_step_s=controller.stepped_s))
+    steps_s = controller.steps_s
+    stepped = dict(recovery_step_s=next(iter(steps_s), None), recovery_steps=len(steps_s))
+    return replace(result, metrics=replace(result.metrics, **stepped))
 
 
 def _check(tape: Tape, stand_s: float) -> None:

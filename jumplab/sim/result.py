@@ -119,9 +119,10 @@ class Metrics(Shown):
     landing_force_n: Maybe = None
     # largest way of a toe along the ground while its foot is loaded, until the last touchdown [m]
     slip_m: Maybe = None
-    # when, after touchdown, a foot left to catch the robot elsewhere; where the feet end counts
-    # that step then
+    # when, after touchdown, a foot first left to catch the robot elsewhere; where the feet end
+    # counts such steps
     recovery_step_s: Maybe = None
+    recovery_steps: int = 0
     qp_solves: int  # of the landing controller
     qp_failures: int
 
@@ -164,7 +165,8 @@ class SimulationResult(Shown, Named):
         far, high = (
             "none" if x is None else f"{x:.3f} m" for x in (m.foot_distance_m, m.com_rise_m)
         )
-        stepped = "" if m.recovery_step_s is None else " after a recovery step"
+        many = "s" * (m.recovery_steps > 1)
+        stepped = f" after {m.recovery_steps} recovery step{many}" if m.recovery_steps else ""
         verdict = f"stands {m.standing_s:.2f} s{stepped}" if m.landed else f"FAILED, {m.reason}"
         return f"travel {far}, rise {high}, {verdict}"
 

@@ -102,13 +102,13 @@ class MarginReport(Shown):
     engine: str
     n: int  # robots per size
     target: dict[str, float]
-    step: bool = False  # whether one recovery step was allowed
+    step: bool = False  # whether recovery steps were allowed
     feedback: bool = False  # whether the launch was corrected
 
     def line(self) -> str:
         """Number of disturbances that are tolerated up to the largest size tried."""
         whole = sum(m.share == 1 for m in self.margins)
-        ways = ", one recovery step allowed" * self.step + ", launch corrected" * self.feedback
+        ways = ", recovery steps allowed" * self.step + ", launch corrected" * self.feedback
         return (
             f"{len(self.margins)} margins in {self.engine}{ways}, "
             f"{whole} of them at the largest size tried"

@@ -58,7 +58,7 @@ LAUNCH = (
     "CoM and angular momentum are led back to the plan",
 )
 REAIM = "no", "the legs turn in the air against errors of trunk, speed and momentum, about all axes"
-STEP = "none", "one, if the robot would come to rest beyond its soles"
+STEP = "none", "whenever the robot would come to rest beyond its soles"
 KNOWN = (
     "plan, planned robot, lengths of links, ground, gravity, time, where the jump begins and its "
     "heading"
@@ -119,7 +119,7 @@ class TrialSettings:
     noise: SensorNoise = field(default_factory=SensorNoise.typical)
     ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
     engine: str = DEFAULT_ENGINE  # or "mujoco"
-    step: bool = False  # allow one recovery step where the feet alone cannot catch the robot
+    step: bool = False  # allow recovery steps where the feet alone cannot catch the robot
     feedback: bool = False  # correct the launch; open loop otherwise, but on one foot
     contact: str = CONTACTS[0]  # how the ground gives way
 
@@ -295,7 +295,7 @@ class TrialReport(Shown):
     def line(self) -> str:
         """Number of robots that landed, in one line."""
         low, high = self.interval
-        steps = f" ({self.stepped} with a recovery step)" if self.settings.step else ""
+        steps = f" ({self.stepped} with recovery steps)" if self.settings.step else ""
         return f"{self.landed} of {self.count} land{steps}, 95 % interval {low:.1%} ... {high:.1%}"
 
     @property
@@ -320,7 +320,7 @@ class TrialReport(Shown):
 
     @property
     def stepped(self) -> int:
-        """Number of those that landed with a recovery step."""
+        """Number of those that landed with recovery steps."""
         landed = [t.metrics for t in self.trials if t.landed and t.metrics]
         return sum(m.recovery_step_s is not None for m in landed)
 
