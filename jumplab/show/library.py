@@ -75,5 +75,5 @@ def _described(row: Mapping[str, Any]) -> str:
         ahead_m = max([place["ahead_m"] for place in target["places"]])
         words += f", {ahead_m:.2f} m ahead"
     else:
-        words = describe_task(JumpTask(**target))
+        words = describe_task(JumpTask.of(target))
     return words
