@@ -212,7 +212,7 @@ def test_what_is_measured_enters_the_next_plan(bhr):
     see.learn_place(first, [second], second.began_at)
     third = see.look(2, 3.0, np.array([1.33, 0.0, 0.0]), True, second)
     foretold, place = 1.33 - 0.12, 1.33 - 0.12 - 0.01
-    assert (third.foretold_m, third.place_m) == pytest.approx((foretold, place))
+    assert (third.foretold[0], third.place_m) == pytest.approx((foretold, place))
     missed = [0.04, 0.66 - (place - 0.56)]
     assert echo.asked[-1][0].distance_m == pytest.approx(1.8 - place + np.mean(missed))
 
