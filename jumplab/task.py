@@ -80,6 +80,7 @@ class JumpTask(Shown):
             )
 
     @classmethod
+    @checked
     def of(cls, data: Mapping[str, Any]) -> Self:
         """The target in plain ``data``, as summaries of plans have it; numbers of other versions
         are left out.
