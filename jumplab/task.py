@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 from jumplab.arguments import checked, real
 from jumplab.errors import InputError, Shown
@@ -77,6 +78,19 @@ class JumpTask(Shown):
                 f"rotation = {math.degrees(self.rotation_rad):g} deg: the robot lands on its feet "
                 f"only after a multiple of 360 deg; nearest is {360 * round(turns):g} deg"
             )
+
+    @classmethod
+    @checked
+    def of(cls, data: Mapping[str, Any]) -> Self:
+        """The target in plain ``data``, as summaries of plans have it; numbers of other versions
+        are left out.
+
+        Raises :class:`InputError` if it lacks distance or rise, or for numbers that cannot be
+        meant.
+        """
+        if not {"distance_m", "height_m"} <= data.keys():
+            raise InputError("a target has a distance_m and a height_m; plan the jump again")
+        return cls(**{f.name: data[f.name] for f in fields(cls) if f.name in data})
 
     @property
     def in_plane(self) -> bool:

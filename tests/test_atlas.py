@@ -51,7 +51,6 @@ def optimum(task: JumpTask, plan) -> float:
 
 def test_every_node_has_a_plan():
     assert sorted(atlas().nodes) == [(d, h) for d in DISTANCES for h in HEIGHTS]
-    assert all(0.3 < n.share <= 1.0 and n.limiting for n in atlas().nodes.values())
     assert repr(atlas()) == "Atlas(bhr, 0.5 ... 0.9 m far, 0.3 ... 0.45 m high, 6 of 6 planned)"
 
 

@@ -1,11 +1,9 @@
-"""The audit's own quantities against closed forms that no planner made, and folders that are damaged."""
+"""The audit's own quantities against closed forms that no planner made."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,10 +11,9 @@ import pinocchio as pin
 import pytest
 from fixtures_audit import ROBOT, good_tape, with_forces
 
-from jumplab.auditing import audit, write_audit
+from jumplab.auditing import audit
 from jumplab.auditing.motion import capture, foot_turn
 from jumplab.auditing.replay import replay
-from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot.stance import com_from_toe, stance_angles, stance_configuration
 from jumplab.task import JumpTask
@@ -126,47 +123,3 @@ def test_step_between_two_surfaces(statue_and_top):
     short[-1, :, 0] = r.foot[0, :, 0] + 0.26  # the soles now land 2 cm ahead of where they were
     near = dataclasses.replace(r, foot=short, foot_rotation=r.foot_rotation[[0] * len(short)])
     assert near.edge == pytest.approx(toe)
-
-
-def write_folder(path, tape: Tape, **summary):
-    tape.save(path / "plan.npz")
-    (path / "robot.urdf").write_text(ROBOT.urdf)
-    (path / "robot.toml").write_text(ROBOT.config_text)
-    (path / "summary.json").write_text(json.dumps(summary))
-
-
-def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
-    write_folder(tmp_path, good)
-    (tmp_path / "passport.json").write_text("that of an older plan")
-    files = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "replace", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        write_audit(tmp_path)
-    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == files
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("plan.npz", None, "no such plan"),
-        ("plan.npz", "PK not a zip", "not a readable plan"),
-        ("robot.urdf", None, "cannot be read"),
-        ("robot.urdf", "<robot", "ends before </robot>; it is cut short"),
-        ("robot.toml", "name = ", "not a TOML file"),
-        ("summary.json", "{", "not a readable JSON file"),
-        ("summary.json", "[]", "not a JSON object"),
-        ("summary.json", '{"target": {"distance_m": 99, "height_m": 0.5}}', "distance = 99 m is outside"),
-    ],
-)
-def test_damaged_folder_is_refused_in_one_sentence(good, tmp_path, name, content, message):
-    write_folder(tmp_path, good)
-    (tmp_path / name).unlink()
-    if content is not None:
-        (tmp_path / name).write_text(content)
-    with pytest.raises((InputError, RobotError), match=message) as error:
-        write_audit(tmp_path)
-    assert "\n" not in str(error.value) and not (tmp_path / "passport.json").exists()

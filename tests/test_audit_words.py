@@ -18,6 +18,7 @@ from jumplab.auditing.motion import form, mirror
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import LIMITS, Limit
 from jumplab.errors import InputError, RobotError
+from jumplab.io import folder as store
 from jumplab.io.folder import versions
 from jumplab.robot.stance import stance_configuration
 from jumplab.task import JumpTask
@@ -395,39 +396,19 @@ def test_symmetry_names_what_is_worst():
 # ------------------------------------------------------------------------------------------------ folders
 
 
-def write(folder, target=None, **summary):
-    random_tape(0).save(folder / "plan.npz")
-    (folder / "robot.urdf").write_text(ROBOT.urdf)
-    (folder / "robot.toml").write_text(ROBOT.config_text)
-    (folder / "summary.json").write_text(json.dumps({"target": target, **summary}))
-
-
 def test_a_folders_target_edge_and_place(tmp_path):
-    target, into = {"distance_m": 0.4, "height_m": 0.1, "platform_m": 0.3}, tmp_path / "into"
-    task, tape = JumpTask(**target), random_tape(0)
-    into.mkdir()
-    write(tmp_path, target | {"unknown": 3}, platform_edge_m=0.123)
-    found = write_audit(tmp_path, into=into)
+    tape = random_tape(0)
+    task = JumpTask(0.4, 0.1, platform_m=0.3)
+    summary = {"target": dataclasses.asdict(task) | {"unknown": 3}, "platform_edge_m": 0.123}
+    store.write_plan(tmp_path, tape, ROBOT, summary)
+    found = write_audit(tmp_path)
     assert len(found.manifest["plan_sha256"]) == 64 and found.manifest["robot_hash"] == ROBOT.hash
     assert found.checks == audit(tape, ROBOT, task, edge_m=0.123).checks != audit(tape, ROBOT, task).checks
-    assert [p.name for p in into.iterdir()] == ["passport.json"] and not (tmp_path / "passport.json").exists()
-    assert json.loads((into / "passport.json").read_text())["manifest"]["planner"]["platform_edge_m"] == 0.123
-    for other in (None, "far", {"distance_m": 1.0}, [0.4, 0.1]):
-        write(tmp_path, other)
-        assert write_audit(tmp_path).manifest["target"] is None
-    write(tmp_path, {"distance_m": 0.4, "height_m": 0.1})
-    assert write_audit(tmp_path).manifest["target"] == dataclasses.asdict(JumpTask(0.4, 0.1))
-    (tmp_path / "summary.json").unlink()
-    assert write_audit(tmp_path).manifest["planner"] == {}
-    for name in ("robot.urdf", "robot.toml"):
-        text = (tmp_path / name).read_text()
-        (tmp_path / name).write_bytes(b"\xff\xfe")
-        with pytest.raises(InputError) as e:
-            write_audit(tmp_path)
-        path = tmp_path / name
-        assert str(e.value) == f"{path}: cannot be read (UnicodeDecodeError); plan the jump again into this folder"
-        (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=r"^a result folder must be a path, got 3$"):
-        write_audit(3)
-    with pytest.raises(InputError, match=r"^the passport's folder must be a path, got 3$"):
-        write_audit(tmp_path, into=3)
+    assert json.loads((tmp_path / "passport.json").read_text())["manifest"]["planner"]["platform_edge_m"] == 0.123
+    (tmp_path / "robot.urdf").unlink()
+    with pytest.raises(InputError, match=r"^the plan in .* cannot be read \(No such file or directory\)$"):
+        write_audit(tmp_path)
+    store.write_plan(tmp_path, tape, ROBOT, {"target": {"distance_m": 1.0}})
+    with pytest.raises(InputError, match=r"^a target has a distance_m and a height_m; plan the jump again$"):
+        write_audit(tmp_path)
+    assert not (tmp_path / "passport.json").exists()

@@ -90,10 +90,7 @@ def test_jump_without_a_plan_is_named_before_anything_moves(monkeypatch):
     ("arguments", "sentence"),
     [
         ({"solve_s": -0.1}, "solve_s = -0.1 s is outside 0 ... 60 s"),
-        ({"look_s": "soon"}, "look_s must be a number, got 'soon'"),
         ({"method": "magic"}, "method 'magic': choose one of three-step, direct"),
-        ({"landing": "soft"}, "landing 'soft': choose one of planned, spring"),
-        ({"revise_s": 3}, "revise_s = 3 s is outside 0 ... 2 s"),
     ],
 )
 def test_settings_that_make_no_sense(arguments, sentence):
@@ -215,7 +212,7 @@ def test_what_is_measured_enters_the_next_plan(bhr):
     see.learn_place(first, [second], second.began_at)
     third = see.look(2, 3.0, np.array([1.33, 0.0, 0.0]), True, second)
     foretold, place = 1.33 - 0.12, 1.33 - 0.12 - 0.01
-    assert (third.foretold_m, third.place_m) == pytest.approx((foretold, place))
+    assert (third.foretold[0], third.place_m) == pytest.approx((foretold, place))
     missed = [0.04, 0.66 - (place - 0.56)]
     assert echo.asked[-1][0].distance_m == pytest.approx(1.8 - place + np.mean(missed))
 

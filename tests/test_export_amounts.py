@@ -79,79 +79,27 @@ def test_every_number_of_the_joint_table():
     assert max(len(x) for x in lines[1].split(",")[4:]) >= 10  # nine digits
 
 
-def test_every_plain_array():
-    motion = short()
-    for rate, rows in ((1000.0, [*ROWS, LAST]), (500.0, [*ROWS[::2], LAST])):
-        x = export.plain_arrays(WHOLE, frames(rate), rate)
-        turn = Rotation.from_quat(motion.q[rows, 3:7])
-        expected = {
-            "time_s": np.append(np.arange(len(rows) - 1) / rate, 0.0205), "phase": motion.phase[rows],
-            "contact": np.repeat(motion.phase[rows][:, None] != "flight", 2, axis=1),
-            "joint_names": np.array(WHOLE.joints),
-            "base_position_m": motion.q[rows, :3], "base_quaternion_xyzw": turn.as_quat(),
-            "base_velocity_world_m_s": turn.apply(motion.v[rows, :3]),
-            "base_angular_velocity_world_rad_s": turn.apply(motion.v[rows, 3:6]),
-            "joint_position_rad": motion.q[rows, 7:][:, AT], "joint_velocity_rad_s": motion.v[rows, 6:][:, AT],
-            "joint_torque_N_m": motion.tau[rows][:, AT]}  # fmt: skip
-        assert list(x) == list(expected)
-        for name, values in expected.items():
-            if name == "base_quaternion_xyzw":
-                np.testing.assert_allclose(Rotation.from_quat(x[name]).as_matrix(), turn.as_matrix(), atol=1e-9)
-                assert (np.sum(x[name][1:] * x[name][:-1], axis=1) > 0).all()
-            elif values.dtype.kind in "Ub":
-                assert x[name].tolist() == values.tolist(), name
-            else:
-                np.testing.assert_allclose(x[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
-
-
 # clips ----------------------------------------------------------------------------------------------------------
 KEYS = ["fps", "joint_pos", "joint_vel", "joint_torque", "body_pos_w", "body_quat_w", "body_lin_vel_w",
         "body_ang_vel_w", "contact", "phase", "joint_names", "body_names"]  # fmt: skip
 
 
-def test_names_and_kinds_of_what_trackers_read():
-    motion, clip = short(), export.tracked(WHOLE, frames(500.0), 500.0)
-    assert list(clip) == KEYS and clip["fps"].dtype == np.int64 and list(clip["fps"]) == [500]
-    assert {clip[k].dtype for k in KEYS[1:8]} == {np.dtype(np.float32)} and clip["contact"].dtype == bool
-    assert list(export.tracked(WHOLE, frames(12.5), 12.5)["fps"]) == [12.5]
-    rows = [*ROWS[::2], LAST]
-    for name, values in (("joint_pos", motion.q[:, 7:]), ("joint_vel", motion.v[:, 6:]), ("joint_torque", motion.tau)):
-        np.testing.assert_allclose(clip[name], values[rows][:, AT], rtol=1e-6, atol=1e-5)
-    assert list(clip["phase"]) == list(motion.phase[rows])
-    assert list(clip["joint_names"]) == list(WHOLE.joints) and list(clip["body_names"]) == list(WHOLE.links)
-    assert (np.sum(clip["body_quat_w"][1:] * clip["body_quat_w"][:-1], axis=-1) > 0).all()
-
-
-def test_the_world_is_the_first_body():
+def test_what_no_format_says_of_places():
+    """Torques, phases, names and kinds of numbers; places and speeds are compared with MuJoCo's in test_export."""
     x = frames(500.0)
-    clip, bare = export.with_root(WHOLE, x, 500.0), export.tracked(WHOLE, x, 500.0, at_com=True)
-    assert list(clip) == KEYS and list(clip["body_names"]) == ["world", *WHOLE.links]
-    assert not clip["body_pos_w"][:, 0].any() and not clip["body_lin_vel_w"][:, 0].any()
-    assert (clip["body_quat_w"][:, 0] == [1, 0, 0, 0]).all() and not clip["body_ang_vel_w"][:, 0].any()
-    for name in KEYS[4:8]:
-        np.testing.assert_array_equal(clip[name][:, 1:], bare[name])
-    np.testing.assert_allclose(clip["joint_pos"], np.hstack([x.q[:, :3], x.q[:, [6, 3, 4, 5]], x.q[:, 7:]]), atol=1e-6)
-    np.testing.assert_allclose(
-        clip["joint_vel"], np.hstack([Rotation.from_quat(x.q[:, 3:7]).apply(x.v[:, :3]), x.v[:, 3:]]), atol=1e-5
-    )
-    assert clip["joint_pos"].dtype == clip["body_pos_w"].dtype == np.float32
-
-
-def test_what_retargeters_keep():
-    x, clip = frames(30.0), export.retargeted(WHOLE, frames(30.0), 30.0)
-    names = ["fps", "root_pos", "root_rot", "dof_pos", "local_body_pos", "link_body_list"]
-    assert list(clip) == [*names, "dof_torque", "contact", "phase", "joint_names"] and clip["fps"] == 30.0
-    assert clip["link_body_list"] == list(WHOLE.links) and clip["joint_names"] == list(WHOLE.joints)
-    for name, values in dict(root_pos=x.q[:, :3], root_rot=x.q[:, 3:7], dof_pos=x.q[:, 7:], dof_torque=x.tau).items():
-        np.testing.assert_array_equal(clip[name], values)
-    data = MODEL.createData()
-    still = pin.neutral(MODEL)
-    for k, angles in enumerate(x.q[:, 7:]):
-        still[7:][AT] = angles
-        pin.framesForwardKinematics(MODEL, data, still)
-        for i, link in enumerate(WHOLE.links):
-            expected = data.oMf[MODEL.getFrameId(link)].translation
-            np.testing.assert_allclose(clip["local_body_pos"][k, i], expected, atol=1e-9)
+    plain, clip, root = (make(WHOLE, x, 500.0) for make in (export.plain_arrays, export.tracked, export.with_root))
+    lists = export.retargeted(WHOLE, x, 500.0)
+    for arrays, name in ((plain, "joint_torque_N_m"), (clip, "joint_torque"), (root, "joint_torque")):
+        np.testing.assert_allclose(arrays[name], short().tau[[*ROWS[::2], LAST]][:, AT], rtol=1e-6)
+        assert list(arrays["phase"]) == lists["phase"] == list(short().phase[[*ROWS[::2], LAST]])
+        assert list(arrays["joint_names"]) == list(WHOLE.joints) and arrays["contact"].dtype == bool
+    assert list(clip) == list(root) == KEYS and {clip[k].dtype for k in KEYS[1:8]} == {np.dtype(np.float32)}
+    assert list(root["body_names"]) == ["world", *WHOLE.links] and root["joint_pos"].dtype == np.float32
+    for name, still in zip(KEYS[4:8], ([0] * 3, [1, 0, 0, 0], [0] * 3, [0] * 3), strict=True):
+        assert (root[name][:, 0] == still).all()
+    assert clip["fps"].dtype == np.int64 and list(export.tracked(WHOLE, frames(12.5), 12.5)["fps"]) == [12.5]
+    assert plain["time_s"] == pytest.approx([*np.arange(len(x.t) - 1) / 500, 0.0205]) and lists["fps"] == 500.0
+    assert lists["link_body_list"] == list(WHOLE.links) and (lists["dof_torque"] == x.tau).all()
 
 
 TREE = """<robot name="x">

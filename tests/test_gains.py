@@ -45,9 +45,9 @@ def test_derivatives_are_those_of_the_dynamics(q, carries):
         """Accelerations beside the state; the springs, which are off it by its twist alone, by their definition."""
         there = pin.integrate(MODEL, q, error[:NV])
         free = dynamics.accelerations(there, v + error[NV:], tau, held)[0]
-        jacobians = dynamics._jacobians(held)
+        jacobians = dynamics.jacobians(held)
         pin.computeJointJacobians(dynamics.model, dynamics.data, q)
-        off = [j @ error[:NV] for j in dynamics._jacobians(held)]
+        off = [j @ error[:NV] for j in dynamics.jacobians(held)]
         turns = [(dynamics.data.oMi[joint] * place).rotation for joint, place, _ in held]
         if held:
             middle = np.mean([turn @ x[:3] for turn, x in zip(turns, off, strict=True)], axis=0)
@@ -55,7 +55,7 @@ def test_derivatives_are_those_of_the_dynamics(q, carries):
                 x[:3] -= turn.T @ middle
         springs = np.concatenate([np.zeros(NV), *(-gains.STIFFNESS * x for x in off)])
         pin.computeAllTerms(dynamics.model, dynamics.data, there, v)
-        return free + dynamics._solved(jacobians, springs)[:NV]
+        return free + dynamics.solved(jacobians, springs)[:NV]
 
     seen = slopes(away, np.zeros(2 * NV), 1e-6)
     assert np.abs(by_error - seen).max() < 1e-6 * np.abs(seen).max()

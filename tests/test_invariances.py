@@ -16,17 +16,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_robots import child
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from test_audit_amounts import JOINTS, random_tape
-from test_cli import one_sentence
 from test_export_amounts import short
 
 import jumplab as jl
 from jumplab.auditing import AuditReport, audit
-from jumplab.cli import main as command_line
-from jumplab.cli.common import values_of
-from jumplab.errors import InputError
 from jumplab.io.files import open_log
 from jumplab.io.folder import read_json, to_json
 from jumplab.io.motion import Motion
@@ -358,42 +354,3 @@ def test_a_log_that_was_cut_loses_its_last_line_at_most(tmp_path_factory, rows, 
         log.add({"key": more, "value": "new"})
     with opened() as log:
         assert log.done == left | {more: "new"}
-
-
-# command line ---------------------------------------------------------------------------------------------------
-BAD = st.one_of(
-    st.floats(3.001, 1e300).map(repr), st.floats(-1e300, -3.001).map(repr), st.sampled_from(["nan", "inf", "-inf"]),
-    st.text(st.characters(categories=["L", "P", "Zs"], exclude_characters="-"), min_size=1).filter(
-        lambda x: not re.fullmatch(r"(?i)\s*(nan|inf(inity)?)\s*", x)),
-)  # fmt: skip
-
-
-@settings(MANY, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(text=BAD)
-def test_a_distance_that_cannot_be_meant(capsys, tmp_path_factory, text):
-    """One sentence: that the text is no number, or what the target itself says about the number."""
-    out = tmp_path_factory.getbasetemp() / "no_plan"
-    code = command_line.main(["plan", f"--distance-m={text}", "--height-m", "0.5", "--out", str(out)])
-    said = one_sentence(code, *capsys.readouterr())
-    try:
-        expected = f"--distance-m must be a number, got {text!r}" if not is_number(text) else ""
-        JumpTask(float(text) if not expected else 0.0, 0.5)
-    except InputError as e:
-        expected = str(e)
-    assert said == " ".join(expected.split()) and not out.exists()
-
-
-def is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-@MANY
-@given(st.floats(-3, 3), st.floats(-3, 3), st.integers(1, 30))
-def test_a_grid_is_read_as_it_is_written(first, last, count):
-    found = values_of("--distance-m", f"{first!r}:{last!r}:{count}")
-    np.testing.assert_allclose(found, np.linspace(first, last, count), atol=1e-9)
-    assert values_of("--distance-m", ",".join(map(repr, found))) == found

@@ -422,11 +422,6 @@ def test_points_know_the_robot_by_name(bhr):
     assert str(e.value).startswith("the robot has no point 'elbow'; it has left_ankle_pitch, left_ankle_roll")
 
 
-def test_names_that_do_not_exist_are_refused():
-    with pytest.raises(InputError, match="the problem 'whole body' has no such term"):
-        planner().plan(SIDE, "direct", weights={"whole body/flight/torq": 0.01})
-
-
 def test_platforms_that_would_lie_under_a_sole_are_refused():
     with pytest.raises(InfeasibleError) as e:
         planner().plan(replace(SIDE, platform_m=0.2), "direct")

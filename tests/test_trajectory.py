@@ -23,19 +23,6 @@ def make_tape(**other) -> Tape:
     return Tape(**(arrays | other))
 
 
-def test_round_trip(odd_folder):
-    """Without pickle; the file says its schema."""
-    tape, path = make_tape(), odd_folder / "plan.npz"
-    tape.save(path)
-    back = Tape.load(path)
-    assert back.arrays().keys() == tape.arrays().keys()
-    for name, x in tape.arrays().items():
-        assert x.dtype == back.arrays()[name].dtype
-        np.testing.assert_array_equal(x, back.arrays()[name])
-    with np.load(path, allow_pickle=False) as file:
-        assert str(file["schema"]) == SCHEMA and set(file.files) == set(tape.arrays())
-
-
 def test_takeoff_appears_twice():
     tape = make_tape()
     assert tape.takeoff_index == 3 and tape.takeoff_time == 0.002

@@ -10,9 +10,7 @@ from jumplab.arguments import checked
 from jumplab.auditing import contact, dynamics, motion
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import LIMITS, AuditReport, Check, Limit, Measure, of_size
-from jumplab.errors import InputError, as_path
-from jumplab.io.files import write_file
-from jumplab.io.folder import CONFIG, PLAN, SUMMARY, URDF, read_json, sha256, versions
+from jumplab.io.folder import PLAN, read_plan, sha256, transaction, versions
 from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -77,45 +75,17 @@ def _checks(measures: Iterable[Measure], limits: Mapping[str, Limit] = LIMITS) -
     return [limits[name].check(*values) for name, *values in measures]
 
 
-def write_audit(folder: str | Path, *, into: str | Path | None = None) -> AuditReport:
-    """Audit the plan in a result folder and write ``passport.json`` beside it (or into another
-    folder).
+def write_audit(folder: str | Path) -> AuditReport:
+    """Audit the plan in a result folder and write ``passport.json`` beside it.
 
-    Reads ``plan.npz``, ``robot.urdf``, ``robot.toml`` and, for the target and the manifest,
-    ``summary.json`` if it is there; takes no lock, since the folder may be one that is being
-    written. Raises :class:`InputError` if a file is missing or damaged, or the folder cannot be
-    written to.
+    Raises :class:`InputError` if the folder holds no whole plan, or cannot be written.
     """
     tell("audit")
-    folder = as_path(folder, "a result folder")
-    tape = Tape.load(folder / PLAN)
-    humanoid = Robot.from_text(_text(folder / URDF), _text(folder / CONFIG))
-    summary = read_json(folder / SUMMARY) if (folder / SUMMARY).exists() else {}
-    task = _task_of(summary)
-    edge = summary.get("platform_edge_m") if task else None
-    report = audit(tape, humanoid, task, edge_m=edge)
-    manifest = {**report.manifest, "plan_sha256": sha256(folder / PLAN), "planner": summary}
+    tape, robot, summary = read_plan(folder)
+    task = JumpTask.of(summary["target"])
+    report = audit(tape, robot, task, edge_m=summary.get("platform_edge_m"))
+    manifest = {**report.manifest, "plan_sha256": sha256(Path(folder, PLAN)), "planner": summary}
     report = dataclasses.replace(report, manifest=manifest)
-    write_file(
-        (folder if into is None else as_path(into, "the passport's folder")) / REPORT,
-        report.to_json().encode(),
-    )
+    with transaction(folder) as staging:
+        (staging / REPORT).write_text(report.to_json(), encoding="utf-8")
     return report
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(
-            f"{path}: cannot be read ({type(e).__name__}); plan the jump again into this folder"
-        ) from e
-
-
-def _task_of(summary: dict) -> JumpTask | None:
-    """The target that a summary names under ``target``; None if it names none."""
-    target = summary.get("target")
-    if not isinstance(target, dict) or not {"distance_m", "height_m"} <= set(target):
-        return None
-    known = {f.name for f in dataclasses.fields(JumpTask)}
-    return JumpTask(**{k: v for k, v in target.items() if k in known})

@@ -74,7 +74,6 @@ VALUES = "FROM:TO:COUNT or A,B,..."
 folder = needing("name a folder", str.strip)
 KINDS = {
     "number": number,
-    "number or never": lambda option, text: None if text == "never" else number(option, text),
     "degrees": lambda option, text: math.radians(number(option, text)),
     "whole": whole,
     "values": values_of,

@@ -89,10 +89,7 @@ def audit(args: Namespace) -> None:
     """Check a plan with an independent implementation."""
     from jumplab.auditing import write_audit
 
-    io.folder.read_plan(args.dir)  # refuses a damaged folder
-    folder = io.folder.ensure_writable(args.dir)
-    with io.folder.transaction(folder) as staging:
-        report = write_audit(folder, into=staging)
+    report = write_audit(args.dir)
     args.found |= _audited(report)
     print(report.table())
     judge(report, args.dir)
@@ -145,7 +142,7 @@ def view(args: Namespace) -> None:
         words = f"{film.frames} frames, {film.seconds:.1f} s at half speed"
         hint = ""
     else:
-        task = JumpTask(**summary["target"])
+        task = JumpTask.of(summary["target"])
         page = jl.plots.page(robot, plan=tape, simulation=simulation, task=task, scene=scene)
         page.save(path)
         args.found["title"] = words = page.title

@@ -8,6 +8,7 @@ import pickle
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import resources
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from jumplab.robot import Robot
 
 HELD_RAD = 0.02  # by which joints that a format leaves out may move
 LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
+# of a box, around the numbers of its corners, seen from outside
+FACES = "1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"
 PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
 
 
@@ -88,15 +91,10 @@ def _write_mesh(path: Path, block: tuple[np.ndarray, np.ndarray, float] | None) 
     if block is None:
         path.unlink(missing_ok=True)
         return
-    signs = np.array([[(k >> axis & 1) * 2 - 1 for axis in range(3)] for k in range(8)])
-    lines = ["o platform"]
-    lines += ["v {:.9g} {:.9g} {:.9g}".format(*corner) for corner in signs * block[0]]
-    for axis in range(3):
-        one, other = (1 << (axis + 1) % 3), (1 << (axis + 2) % 3)
-        for base, first, second in ((0, other, one), (1 << axis, one, other)):
-            around = (base, base + first, base + first + second, base + second)  # seen from outside
-            lines.append("f " + " ".join(str(corner + 1) for corner in around))
-    write_file(path, "\n".join([*lines, ""]).encode())
+    corners = product(*((-half, half) for half in block[0]))
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*corner) for corner in corners]
+    lines += [f"f {around}" for around in FACES]
+    write_file(path, "\n".join(["o platform", *lines, ""]).encode())
 
 
 def _encoded(ending: str, content: Any) -> bytes:

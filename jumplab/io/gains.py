@@ -64,12 +64,15 @@ class Dynamics:
                 out.append((joint, place, rows))
         return out
 
-    def _jacobians(self, held: Held) -> list[np.ndarray]:
+    def jacobians(self, held: Held) -> list[np.ndarray]:
+        """Rows (n, nv) of the twists of what is held, of each foot; of the last state."""
         parts = (self.model, self.data)
         return [pin.getFrameJacobian(*parts, *at, pin.LOCAL)[rows] for *at, rows in held]
 
-    def _solved(self, jacobians: list[np.ndarray], right: np.ndarray) -> np.ndarray:
-        """Accelerations, and contact forces (with their sign turned), of right-hand sides."""
+    def solved(self, jacobians: list[np.ndarray], right: np.ndarray) -> np.ndarray:
+        """Accelerations, and contact forces with their sign turned (nv + rows, ...), of right-hand
+        sides of that size, by ``jacobians`` (rows, nv) of each foot.
+        """
         mass = np.triu(self.data.M) + np.triu(self.data.M, 1).T
         rows = np.vstack([np.zeros((0, len(mass))), *jacobians])
         return np.linalg.solve(
@@ -85,12 +88,12 @@ class Dynamics:
         pin.computeAllTerms(model, data, q, v)
         pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
         push = np.concatenate([np.zeros(6), tau - self._damping * v[6:]]) - data.nle
-        jacobians = self._jacobians(held)
+        jacobians = self.jacobians(held)
         due = [
             -pin.getFrameAcceleration(model, data, *at, pin.LOCAL).vector[rows] - DAMPING * j @ v
             for (*at, rows), j in zip(held, jacobians, strict=True)
         ]
-        out = self._solved(jacobians, np.concatenate([push, *due]))
+        out = self.solved(jacobians, np.concatenate([push, *due]))
         return out[: model.nv], -out[model.nv :]
 
     def derivatives(
@@ -101,7 +104,7 @@ class Dynamics:
         data = self.data
         nv = model.nv
         a, forces = self.accelerations(q, v, tau, held)
-        jacobians = self._jacobians(held)
+        jacobians = self.jacobians(held)
         pushes = pin.StdVec_Force([pin.Force.Zero()] * model.njoints)
         for joint, place, rows in held:
             wrench = np.zeros(6)
@@ -120,7 +123,7 @@ class Dynamics:
             off[:3] -= turn.T @ np.mean(ways, axis=0)
             by_place = -a_q - DAMPING * v_q - STIFFNESS * off
             right.append(np.hstack([by_place, -a_v - DAMPING * j, np.zeros((len(rows), nv - 6))]))
-        out = self._solved(jacobians, np.vstack(right))[:nv]
+        out = self.solved(jacobians, np.vstack(right))[:nv]
         return out[:, : 2 * nv], out[:, 2 * nv :]
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
-from jinja2 import Template
 
 from jumplab.errors import InputError
 from jumplab.io.files import write_file
@@ -16,8 +14,8 @@ from jumplab.io.motion import Motion
 from jumplab.robot import Robot
 from jumplab.show.jumps import jump_strobe
 from jumplab.show.movies import write_movie
-from jumplab.show.style import describe_task, file_of, made_with
-from jumplab.show.viewer import Page
+from jumplab.show.style import describe_task, file_of
+from jumplab.show.viewer import Page, filled
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
 
@@ -55,16 +53,14 @@ def clips_page(index: Mapping[str, Any]) -> Page:
         raise InputError(f"the index of a library lacks {missing[0]!r}; give its index.json")
     done = [*index["clips"], *index["left_out"]]
     title = f"{len(index['clips'])} clips of {index['robot']['name']}"
-    form = (resources.files("jumplab.show") / "library.html").read_text(encoding="utf-8")
-    page = Template(form, autoescape=True).render(
-        title=title,
+    return filled(
+        "library.html",
+        title,
         index=index,
         kinds=dict.fromkeys(row["kind"] for row in done),
         missing=index["targets"] - len(done),
         describe=_described,
-        made_with=made_with(),
     )
-    return Page(page, title)
 
 
 def _described(row: Mapping[str, Any]) -> str:
@@ -75,5 +71,5 @@ def _described(row: Mapping[str, Any]) -> str:
         ahead_m = max([place["ahead_m"] for place in target["places"]])
         words += f", {ahead_m:.2f} m ahead"
     else:
-        words = describe_task(JumpTask(**target))
+        words = describe_task(JumpTask.of(target))
     return words

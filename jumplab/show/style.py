@@ -10,8 +10,8 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ContextDecorator, ExitStack
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from threading import RLock
@@ -67,32 +67,22 @@ def use_style() -> None:
     show_waiting()
 
 
-class Style(ContextDecorator):
-    """The style, as a decorator or in a ``with`` block.
+_TURN = RLock()  # settings are the whole process's, so threads take turns
 
-    ``whole`` whatever the caller's settings are, else with those that differ from Matplotlib's
-    defaults left as they are. Settings are the whole process's, so threads take turns.
+
+@contextmanager
+def _style(whole: bool) -> Iterator[None]:
+    """The style within a block or a function: ``whole`` whatever the caller's settings are, else
+    with those that differ from Matplotlib's defaults left as they are.
     """
-
-    _turn = RLock()
-
-    def __init__(self, whole: bool):
-        self._whole = whole
-        self._open: list[ExitStack] = []
-
-    def __enter__(self) -> None:
-        stack = ExitStack()
-        stack.enter_context(self._turn)
-        own = {} if self._whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
-        stack.enter_context(plt.style.context(STYLE_FILE))
-        larger = own.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
-        for key in (key for key in TEXT_SIZES if key not in own):
-            rcParams[key] *= larger
-        rcParams.update(own)
-        self._open.append(stack)
-
-    def __exit__(self, *exc: Any) -> None:
-        self._open.pop().close()
+    with _TURN:
+        own = {} if whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
+        with plt.style.context(STYLE_FILE):
+            larger = own.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
+            for key in (key for key in TEXT_SIZES if key not in own):
+                rcParams[key] *= larger
+            rcParams.update(own)
+            yield
 
 
 def _ours() -> dict[str, Any]:
@@ -102,8 +92,8 @@ def _ours() -> dict[str, Any]:
     }
 
 
-styled = Style(whole=True)
-themed = Style(whole=False)  # for pictures of results: the user's style wins
+styled = _style(whole=True)
+themed = _style(whole=False)  # for pictures of results: the user's style wins
 
 
 class Picture(Figure):
@@ -140,7 +130,7 @@ class Picture(Figure):
 def file_of(fig: Figure, kind: str, **how: Any) -> bytes:
     """A figure as a file of that kind ("png", "pdf"); ``how`` are options of ``Figure.savefig``."""
     buffer = io.BytesIO()
-    with styled, rc_context(getattr(fig, "settings", {})):
+    with _style(whole=True), rc_context(getattr(fig, "settings", {})):
         fig.savefig(buffer, format=kind, **how)
     return buffer.getvalue()
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import jinja2
 import numpy as np
 
 from jumplab.arguments import checked
@@ -26,7 +27,7 @@ from jumplab.robot import Robot
 from jumplab.robot.files import LEG
 from jumplab.show.bodies import ABOVE_M
 from jumplab.show.shapes import PAINTS, Part, Trace, ground_forces, parts_of, trace
-from jumplab.show.style import PHASE_COLORS, describe_task
+from jumplab.show.style import PHASE_COLORS, describe_task, made_with
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
 
@@ -61,6 +62,15 @@ class Page:
             "has not run oneself must be trusted before they may move; or open the HTML file in "
             "the result folder.</small></p>"
         )
+
+
+def filled(form: str, title: str, **facts: Any) -> Page:
+    """The page that a template of Jinja makes of ``facts``; ``form`` is its file."""
+    text = (resources.files("jumplab.show") / form).read_text(encoding="utf-8")
+    html_ = jinja2.Template(text, autoescape=True).render(
+        title=title, made_with=made_with(), **facts
+    )
+    return Page(html_, title)
 
 
 def page(

@@ -123,7 +123,7 @@ class Scene:
             top = summary["target"]["platform_m"]
             if top == 0:
                 return cls.flat()
-            along_rad = JumpTask(**summary["target"]).along_rad
+            along_rad = JumpTask.of(summary["target"]).along_rad
             # soles' middle at x = 0
             edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])
         except (KeyError, TypeError) as e:

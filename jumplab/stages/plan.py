@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -94,14 +94,10 @@ class JumpPlan(Shown, Named):
         """The plan of a result folder: its ``tape`` and its ``summary`` (a mapping); raises
         :class:`InputError` for one without target or method.
         """
-        target = summary.get("target", {})
-        given = {f.name: target[f.name] for f in fields(JumpTask) if f.name in target}
-        if not {"distance_m", "height_m"} <= given.keys() or "method" not in summary:
-            raise InputError(
-                "the summary of the plan lacks the target's distance_m and height_m, or the "
-                "method; plan the jump again"
-            )
-        return cls(JumpTask(**given), robot, summary["method"], tape, dict(summary))
+        if "method" not in summary:
+            raise InputError("the summary of the plan lacks the method; plan the jump again")
+        task = JumpTask.of(summary.get("target", {}))
+        return cls(task, robot, summary["method"], tape, dict(summary))
 
     def line(self) -> str:
         """Robot, target and duration; once it was audited, why that fails or it can hardly land,

@@ -47,8 +47,6 @@ class Node:
     distance_m: float
     height_m: float
     cost: float
-    limiting: str  # what is used most
-    share: float  # of its limit
     x: np.ndarray  # (n,) the motion, as the problem's scaled variables
 
 
@@ -135,8 +133,7 @@ class Atlas:
         for task, row in plan_rows(grid, work, known, "planned", folder, "atlas", **options):
             if row and row["planned"]:
                 place = task.distance_m, task.height_m
-                used = row["cost"], row["limiting"], row["share"]
-                atlas.nodes[place] = Node(*place, *used, np.array(row["x"]))
+                atlas.nodes[place] = Node(*place, row["cost"], np.array(row["x"]))
         if folder is not None:
             atlas.save(folder)
         return atlas
@@ -214,7 +211,7 @@ class Atlas:
             "key": self.key,
             "distances": self.distances,
             "heights": self.heights,
-            "nodes": [(n.distance_m, n.height_m, n.cost, n.limiting, n.share) for n in nodes],
+            "nodes": [(n.distance_m, n.height_m, n.cost) for n in nodes],
         }
         buffer = io.BytesIO()
         folder = Path(folder)
@@ -236,7 +233,8 @@ class Atlas:
             rows = file["rows"]
             if head["format"] != FORMAT or not np.all(np.isfinite(rows)):
                 raise ValueError("unknown format, or numbers that are not finite")
-            nodes = [Node(*node, x) for node, x in zip(head["nodes"], rows, strict=True)]
+            # more than these three numbers was kept once
+            nodes = [Node(*node[:3], x) for node, x in zip(head["nodes"], rows, strict=True)]
             places = {(node.distance_m, node.height_m): node for node in nodes}
             return cls(head["robot"], head["distances"], head["heights"], places, head["key"])
         except FileNotFoundError:

@@ -304,7 +304,7 @@ def certify(
     for engine in ENGINES:
         engine_class(engine)
     plan = PlanOnFile.read(folder)
-    task = JumpTask(**plan.summary["target"])
+    task = JumpTask.of(plan.summary["target"])
     report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
     reports = []
     total = ((n + 1) * len(modes) + 1) * len(ENGINES)

@@ -367,7 +367,7 @@ class TrialReport(Shown):
         run.
         """
         names = ["foot_distance_m", "com_rise_m"]
-        names += [] if JumpTask(**self.target).in_plane else ["side_m", "yaw_rad"]
+        names += [] if JumpTask.of(self.target).in_plane else ["side_m", "yaw_rad"]
         measured = {}
         for name in names:
             x = self.values(name)

@@ -83,19 +83,9 @@ class Ahead:
     controller: Controller | None = None  # of the jump
 
     @property
-    def foretold_m(self) -> float:
-        """Predicted place of the feet ahead [m]."""
-        return float(self.foretold[0])
-
-    @property
     def place_m(self) -> float:
-        """The same, corrected [m]."""
+        """Predicted place of the feet ahead, corrected [m]."""
         return float(self.place[0])
-
-    @property
-    def bias_m(self) -> float:
-        """Correction that was added to the distance [m]."""
-        return float(self.bias[0])
 
     @property
     def ready_s(self) -> float:

@@ -26,6 +26,12 @@ from jumplab.sim.scene import Scene
 from jumplab.studies.chain.foresight import Ahead, Foresight
 
 MODE = "whole-body"  # of the servos
+LANDING = "spring"  # landing controller
+# when the next jump is planned, before the touchdown that is due: just before the apex of a rise of
+# 0.3 m, from where the toes' place is foretold to 2 mm
+LOOK_S = 0.3
+# after touchdown, when that plan is made again: the impact is over, the feet lie flat and still
+REVISE_S = 0.1
 # the first plan, too, is made from a measured posture, once a push of the start is gone
 FIRST_STAND_S = 0.5
 # still enough to begin: what is left fades within BLEND_S
@@ -41,16 +47,12 @@ PATIENCE_S = 3.0  # who is not still this long after touchdown will not be
 
 @dataclass
 class ChainPilot:
-    """Torques of a whole chain, as its :class:`Foresight` plans it; ``landing``, ``look_s`` [s] and
-    ``revise_s`` [s] are those of :func:`jumplab.studies.chain.run_chain`, ``hardware`` that of each
+    """Torques of a whole chain, as its :class:`Foresight` plans it; ``hardware`` is that of each
     jump's :class:`jumplab.control.Controller`.
     """
 
     foresight: Foresight
     scene: Scene
-    landing: str
-    look_s: float
-    revise_s: float | None
     hardware: Hardware = Hardware()
 
     def __post_init__(self):
@@ -121,8 +123,7 @@ class ChainPilot:
             last = self.jumps[-1] if self.jumps else None
             self.plans.append(self.foresight.look(number, step * STEP_S, *seen, last))
         elif plans and since >= 0:
-            revisable = plans[-1].air and self.revise_s is not None
-            if all(p.failure for p in plans) and not revisable:
+            if all(p.failure for p in plans) and not plans[-1].air:
                 self.reason = f"no plan for jump {number + 1}: {plans[-1].failure}"
             elif since > PATIENCE_S + sum(p.solve_s for p in plans):
                 self.reason = f"the robot did not come to rest for jump {number + 1}"
@@ -160,17 +161,16 @@ class ChainPilot:
             return self._pose(q), False
         since = self.since_touchdown(step)
         if plans:  # one core plans: a correction waits until the draft is done
-            due = plans[-1].air and self.revise_s is not None and since >= self.revise_s
+            due = plans[-1].air and since >= REVISE_S
             return (self._pose(q), False) if due and step * STEP_S >= plans[-1].ready_s else None
-        if since >= max(self.look_s, 0.0):
+        if since >= 0.0:
             return self._pose(q), False
         jump = self.jumps[-1]
-        airborne = self._now(step) * STEP_S > jump.plan.tape.takeoff_time
-        if since >= 0 or self.look_s >= 0 or not airborne:
+        if self._now(step) * STEP_S <= jump.plan.tape.takeoff_time:
             return None
         now = self._gauge.motion(headed(q, jump.controller.looks_rad), v)
         left = jump.controller.forecast.time_left(now)
-        return None if left > -self.look_s else (self._at_touchdown(step, q, v, left), True)
+        return None if left > LOOK_S else (self._at_touchdown(step, q, v, left), True)
 
     def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
         """Pose (3,) at the touchdown to come: the posture of the tape, turned as far as the trunk
@@ -209,7 +209,7 @@ class ChainPilot:
             self._robot,
             mode=MODE,
             reaim=True,
-            landing=self.landing,
+            landing=LANDING,
             ground=self.scene.seen_along(heading, self._robot, end).top_at,
             hardware=self.hardware,
             start_rad=float(pose[2]),

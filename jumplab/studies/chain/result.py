@@ -25,7 +25,7 @@ SCHEMA = "jumplab-chain-1"
 REPORT = "chain.json"
 LOG = "chain.npz"
 JUMPS = "jumps"
-PLAN_NAMES = "looked_s air foretold_m place_m bias_m solve_s cpu_s ready_s needed_s began_s".split()
+PLAN_NAMES = "looked_s air place_m solve_s cpu_s ready_s needed_s began_s".split()
 
 
 @dataclass(frozen=True)

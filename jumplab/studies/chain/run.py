@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.control import STEP_S
-from jumplab.control.controller import LANDINGS
-from jumplab.errors import InputError, quoted
+from jumplab.errors import InputError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import DEFAULT_ENGINE, Perturbation
@@ -22,10 +21,7 @@ from jumplab.studies.chain.foresight import Foresight, rehearse
 from jumplab.studies.chain.pilot import MODE, ChainPilot
 from jumplab.studies.chain.result import ChainedJump, ChainResult
 
-LOOK_S = -0.3  # just before the apex of a rise of 0.3 m; foretells the toes' place to 2 mm
-REVISE_S = 0.1  # the impact is over, the feet lie flat and still
-# from, to; the earliest look is longer before touchdown than any flight
-TIMES_S = {"solve_s": (0.0, 60.0), "look_s": (-1.0, 2.0), "revise_s": (0.0, 2.0)}
+MOST_S = 60.0  # that a plan may be charged
 
 
 @checked
@@ -37,18 +33,17 @@ def run_chain(
     rehearsal: Sequence[JumpPlan] | None = None,
     perturbation: Perturbation | None = None,
     solve_s: float | None = None,
-    look_s: float = LOOK_S,
-    revise_s: float | None = REVISE_S,
-    landing: str = "spring",
     method: str = USUAL,
     engine: str = DEFAULT_ENGINE,
 ) -> ChainResult:
     """Let a simulated robot jump a course, planning every jump from what is measured on the way.
 
-    The robot waits in a crouch, where it measures its own posture. Planning is charged as simulated
-    time: a plan is there so much later, and the robot holds its crouch if that is late. A chain
-    that fails is a result too. Raises :class:`InputError` or :class:`InfeasibleError`, before
-    anything moves, if the course cannot be jumped, or the robot or a setting makes no sense.
+    The robot waits in a crouch, where it measures its own posture. The next jump is planned in the
+    air and again after touchdown, and begins with the latest plan that is there. Planning is
+    charged as simulated time: a plan is there so much later, and the robot holds its crouch if that
+    is late. A chain that fails is a result too. Raises :class:`InputError` or
+    :class:`InfeasibleError`, before anything moves, if the course cannot be jumped, or the robot or
+    a setting makes no sense.
 
     Parameters
     ----------
@@ -59,15 +54,16 @@ def run_chain(
     perturbation : of the simulated robot. With noise, where the feet stand is odometry, which
         drifts in every impact.
     solve_s : what each plan is charged [s]; its own wall clock if None.
-    look_s : when the next jump is planned, after touchdown [s]; negative: so long before the
-        touchdown that is due.
-    revise_s : when a plan made in the air is made again, after touchdown [s]; never if None. The
-        robot waits for neither: it begins with the latest plan that is there.
-    landing, engine : as in :func:`jumplab.sim.simulate_jump`.
+    engine : as in :func:`jumplab.sim.simulate_jump`.
     method : as of :meth:`jumplab.Planner.plan`.
     """
-    times_s = dict(solve_s=solve_s or 0.0, look_s=look_s, revise_s=revise_s or 0.0)
-    _check(robot, landing, times_s)
+    if not robot.planar:
+        raise InputError(
+            f"robot {robot.name}: a chain needs a planar model of five links, in whose crouch the "
+            "robot waits; choose a robot that has one"
+        )
+    if not 0 <= (solve_s or 0.0) <= MOST_S:
+        raise InputError(f"solve_s = {solve_s:g} s is outside 0 ... {MOST_S:g} s")
     waiting = crouched(robot)
     planner = planner or Planner(waiting, keep=True)
     if planner.robot.hash != waiting.hash:
@@ -80,13 +76,10 @@ def run_chain(
     rehearsal = rehearsal or rehearse(course, planner, method)
     run = Run(waiting, perturbation, course.scene(waiting), engine)
     foresight = Foresight(course, waiting, planner, rehearsal, solve_s)
-    pilot = ChainPilot(foresight, run.scene, landing, look_s, revise_s, run.hardware)
+    pilot = ChainPilot(foresight, run.scene, run.hardware)
     start = stance_configuration(waiting)
     run.play(pilot.drive, pilot.over, start, np.zeros(waiting.model.nv))
     settings = {
-        "look_s": look_s,
-        "revise_s": revise_s,
-        "landing": landing,
         "solve_s": solve_s,
         "method": method,
         "perception": run.perception,
@@ -118,17 +111,3 @@ def _jumps(run: Run, chain: ChainPilot, course: Course) -> tuple[ChainedJump, ..
         )
         jumps.append(ChainedJump(k, first * STEP_S, ahead, plans, log))
     return tuple(jumps)
-
-
-def _check(robot: Robot, landing: str, times_s: Mapping[str, float]) -> None:
-    if not robot.planar:
-        raise InputError(
-            f"robot {robot.name}: a chain needs a planar model of five links, in whose crouch the "
-            "robot waits; choose a robot that has one"
-        )
-    if landing not in LANDINGS:
-        raise InputError(f"landing {quoted(landing)}: choose one of {', '.join(LANDINGS)}")
-    for name, value in times_s.items():
-        low, high = TIMES_S[name]
-        if not low <= value <= high:
-            raise InputError(f"{name} = {value:g} s is outside {low:g} ... {high:g} s")
