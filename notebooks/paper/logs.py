@@ -89,7 +89,7 @@ def age(stamps: Iterable[Mapping[str, Any] | None]) -> str:
     words = [f"{len(stamps) - old - unknown} of {len(stamps)} rows were made by the present code"]
     if old:
         named = sorted(changed)[:NAMED]
-        more = f" and {len(changed) - NAMED} more files" if len(changed) > NAMED else ""
+        more = f" and {len(changed) - NAMED} more" if len(changed) > NAMED else ""
         words.append(f"{old} are older: {', '.join(named)}{more} have changed since")
     if unknown:
         words.append(f"{unknown} are older, without a record of their code")
