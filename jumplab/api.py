@@ -77,14 +77,14 @@ def plan(
     contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of
         your own; or the words of :meth:`Contacts.named`, such as "hop=0.2". It is planned by the
         whole-body program, and audited foot by foot.
-    like : a clip, as :func:`jumplab.judge` takes or returns it, in whose manner the target is to
-        be reached: one flight off both feet and down on both, on level ground.
+    like : a clip whose style the jump follows, as :func:`jumplab.judge` takes or returns it, with
+        one flight off both feet and down on both, on level ground.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
     method : "direct" (the whole body alone) or, for targets in the plane, "three-step" (SRMP,
         joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step"
         where stages 1 or 2, or stage 3's tracking, are changed.
-    robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``,
-        see :mod:`jumplab.studies.robust`.
+    robust : ranges of the perturbed robots that the plan allows for, such as
+        ``jumplab.sim.Ranges()``, see :mod:`jumplab.studies.robust`.
     patience_s : processor time after which planning ends, with the best that was found or a refusal
         [s]; an easier target is looked for in what is left of it, and a fifth more. By default 20 a
         start, 40 for a schedule or a jump like a clip, and 120 for a robust plan.
@@ -153,8 +153,8 @@ def _followed(
 
 @checked
 def audit(plan: JumpPlan) -> AuditReport:
-    """Check a plan by an independent implementation that sees its tape, its robot and its target,
-    and nothing of the planner: :attr:`jumplab.JumpPlan.audit`, made once.
+    """Check a plan by an independent implementation, which sees its tape, its robot and its target,
+    and nothing of the planner. Returns :attr:`jumplab.JumpPlan.audit`, which is computed once.
     """
     return plan.audit
 
@@ -245,8 +245,8 @@ def load(folder: str | Path) -> Saved:
 
 @checked
 def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
-    """The jump in 3-D, plan and simulation: a notebook shows the page, in a script its place is
-    printed, ``view(...).save("jump.html")`` writes it where you like.
+    """Make a 3-D page of the jump, plan and simulation. A notebook shows the page; a script prints
+    its path. ``view(...).save("jump.html")`` writes it to another file.
     """
     from jumplab.show.viewer import page
     from jumplab.sim import Scene

@@ -45,8 +45,8 @@ def test_rows_of_other_code_are_told(tmp_path, now, bhr):
     now["stages/new.py"] = "00000001"  # none of the rows can have used it
     assert logs.rows(path, said.append) == [{"n": n} for n in range(4)]
     assert said == [
-        "log.jsonl: 1 of 4 rows are of the code of now; 2 OLD, since when sim/a.py, stages/a.py changed; "
-        "1 OLD, of code that put no stamp on them"
+        "log.jsonl: 1 of 4 rows were made by the present code; 2 are older: sim/a.py, stages/a.py have changed since; "
+        "1 are older, without a record of their code"
     ]
     made = logs.lines(path)[-1][1]
     assert made["robot"] == f"bhr {bhr.hash}" and made["code"]["sim/a.py"] == "00000001" and "cores" in made["machine"]
@@ -69,7 +69,7 @@ def test_whole_logs_and_tables(tmp_path, now):
     assert logs.table(tmp_path / "b.json", said.append) == {"bhr": 1}
     assert logs.table(tmp_path / "c.json", said.append) == [1, 2, 3]
     assert said == [
-        "a.jsonl: 2 of 2 rows are of the code of now",
-        "b.json: 1 of 1 rows are of the code of now",
-        "c.json: 0 of 3 rows are of the code of now; 3 OLD, of code that put no stamp on them",
+        "a.jsonl: 2 of 2 rows were made by the present code",
+        "b.json: 1 of 1 rows were made by the present code",
+        "c.json: 0 of 3 rows were made by the present code; 3 are older, without a record of their code",
     ]

@@ -96,10 +96,11 @@ def judge(
     Parameters
     ----------
     motion : a plan, tape or simulation; a :class:`.Clip`; or the path of a clip (pickles of motion
-        libraries and retargeters, npz, csv, told by their content; pickles are read without running
-        them), or of a folder of clips.
-    robot : whose motion it is, if it does not carry its own: what :meth:`Robot.load` takes. Of a
-        clip with more joints than it moves, the shipped robot of the same URDF that has those.
+        libraries and retargeters, npz, csv, recognised by their content; pickles are read without
+        running them), or of a folder of clips.
+    robot : whose motion it is, if it does not carry its own: what :meth:`Robot.load` takes. For a
+        clip with more joints than this robot moves, the shipped robot of the same URDF with these
+        joints is taken.
     fps : frame rate of files that do not say [1/s].
     order : of joints without names, "depth-first" or "breadth-first".
     """

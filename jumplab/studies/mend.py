@@ -120,14 +120,15 @@ def mend(
     weights: Mapping[str, float] | None = None,
     limits: Limits | Mapping[str, Any] | None = None,
 ) -> Mended:
-    """The nearest motion to a clip that its robot can do: the clip's contacts, all limits hard.
+    """Plan the nearest motion to a clip that its robot can do: same contacts, all limits hard.
 
-    Its ``.plan`` is a plan as any other, ``.changes`` a table of what became of the clip.
+    The ``.plan`` of the result is like any other; ``.changes`` is a table of the differences
+    from the clip.
 
     Parameters
     ----------
-    motion : one clip, as of :func:`jumplab.judge`, or what that returned of it.
-    robot, fps, order : as there.
+    motion : one clip, as :func:`jumplab.judge` takes it, or the report that it returned.
+    robot, fps, order : as of :func:`jumplab.judge`.
     weights, limits : as of :class:`jumplab.Planner`.
 
     Raises

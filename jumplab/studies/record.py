@@ -195,17 +195,16 @@ def record(
     limits: Limits | Mapping[str, Any] | None = None,
     mesh: Mesh | Mapping[str, int] | None = None,
 ) -> Record:
-    """The largest ``what`` of a target that a plan was found for, and what ends it.
+    """Find the largest value of one number of a target that has a plan, and the limits that end it.
 
     Parameters
     ----------
     robot : who jumps, or what :meth:`Robot.load` takes.
-    what : "height_m", "distance_m", "platform_m", "side_m" or "yaw_rad".
+    what : the number: "height_m", "distance_m", "platform_m", "side_m" or "yaw_rad".
     given : the rest of the target; by default a jump on the spot (a platform as near as it can be),
-        with whatever rise is best.
-    share : of the record, of the plan that is played first; a smaller one follows where a robot
-        falls.
-    engines : in which it is played; none with ().
+        with the rise that gives most.
+    share : of the record; a jump of this share is played first, a smaller one if the robot falls.
+    engines : in which it is played; () plays none.
     terms, weights, off, limits, mesh : as of :class:`jumplab.Planner`.
 
     Raises

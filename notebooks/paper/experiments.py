@@ -473,7 +473,7 @@ def chain_errors(result: ChainResult, trials: Sequence[dict] = ()) -> Figure:
 @styled
 def chain_timeline(result: ChainResult) -> Figure:
     """Motion of the robot above, making of its plans below; a tick where it was ready for the plan."""
-    fig = new_figure(PAGE_IN, 1.5)
+    fig = new_figure(PAGE_IN, 1.7)
     ax = fig.subplots()
     starts = [0, *(np.flatnonzero(result.phase[1:] != result.phase[:-1]) + 1), len(result.phase)]
     for first, after in itertools.pairwise(starts):
@@ -485,13 +485,14 @@ def chain_timeline(result: ChainResult) -> Figure:
             late = jump.number and not plan.in_time
             kind = "late" if late else "planned in the air" if plan.air else "standing"
             ax.barh(0, plan.solve_s, BAR, left=plan.looked_s, color=colors[kind])
-            ax.text(plan.looked_s, -0.36, f"{1000 * plan.solve_s:.0f}", va="top", fontsize=6.5)
+            below = -0.36 if plan.air else -0.7  # two numbers in a line would run together
+            ax.text(plan.looked_s, below, f"{1000 * plan.solve_s:.0f}", va="top", fontsize=6.5)
             if plan.needed_s is not None and jump.number:
                 ax.plot([plan.needed_s] * 2, [-BAR / 2, 1.5], color=INK, linewidth=0.7)
             if plan.began_s is not None:
                 ax.text(plan.began_s + 0.03, 1.38, str(jump.number + 1), ha="left", va="bottom", fontsize=6.5)
     ax.set_yticks([0, 1], ["planning [ms]", "robot"])
-    ax.set(xlabel="time [s]", ylim=(-0.75, 1.75), xlim=(0.0, float(result.t[-1])))
+    ax.set(xlabel="time [s]", ylim=(-1.1, 1.75), xlim=(0.0, float(result.t[-1])))
     ax.grid(False, axis="y")
     bars = [Patch(color=color, label=kind) for kind, color in colors.items()]
     if result.in_time == len(result.replans):

@@ -76,7 +76,7 @@ def stamp(folder: str | Path | None = None, robot: Robot | None = None) -> Row:
 
 
 def age(stamps: Iterable[Mapping[str, Any] | None]) -> str:
-    """Number of rows, each given by its stamp or None, that are of the code of now, and the changes since the others.
+    """Number of rows, each given by its stamp or None, that the present code made, and the changes since the others.
 
     A file that came later does not count: it can only matter through a change of one that was there.
     """
@@ -86,13 +86,13 @@ def age(stamps: Iterable[Mapping[str, Any] | None]) -> str:
         files = [file for file, was in made["code"].items() if now.get(file) != was]
         old += bool(files)
         changed.update(files)
-    words = [f"{len(stamps) - old - unknown} of {len(stamps)} rows are of the code of now"]
+    words = [f"{len(stamps) - old - unknown} of {len(stamps)} rows were made by the present code"]
     if old:
         named = sorted(changed)[:NAMED]
-        more = f" and {len(changed) - NAMED} more files" if len(changed) > NAMED else ""
-        words.append(f"{old} OLD, since when {', '.join(named)}{more} changed")
+        more = f" and {len(changed) - NAMED} more" if len(changed) > NAMED else ""
+        words.append(f"{old} are older: {', '.join(named)}{more} have changed since")
     if unknown:
-        words.append(f"{unknown} OLD, of code that put no stamp on them")
+        words.append(f"{unknown} are older, without a record of their code")
     return "; ".join(words)
 
 

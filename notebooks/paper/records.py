@@ -39,7 +39,7 @@ COLUMNS = {
     "side_m": "to the side [m]",
     "platform_m": "platform [m]",
     "yaw_rad": "turn [rad]",
-    "ends": "the rise ends by",
+    "ends": "limits that end the rise",
 }
 
 

@@ -119,7 +119,7 @@ class Contacts:
     Raises
     ------
     InputError
-        For a schedule that cannot be, in a sentence that names the phase.
+        For an impossible schedule; the message names the phase.
     """
 
     phases: tuple[ContactPhase, ...]
