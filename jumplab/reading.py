@@ -125,9 +125,14 @@ def check_mjcf(
     MuJoCo itself has no such limits. Files that are no XML are left to it.
     """
     try:
-        todo = [(xml(content(path, "robot", error=error), path.name, error), 1)]
+        raw = content(path, "robot", error=error)
+        try:
+            root = xml(raw, path.name, error)
+        except (ValueError, LookupError):  # an encoding that is not known here; its tags are ASCII
+            root = xml(raw.decode("latin-1"), path.name, error)
     except (OSError, ElementTree.ParseError):
         return
+    todo = [(root, 1)]
     for element, above in todo:
         get = element.get
         numbers = [get("count")] if element.tag in COPYING else []
@@ -142,9 +147,10 @@ def check_mjcf(
                 f"most {most} are read; remove it, or ask for fewer"
             )
         todo += [(child, above * copies) for child in element]
-        included = (folder / get("file", "")).resolve()
-        if element.tag == "include" and included not in seen:
-            check_mjcf(included, folder, error, {*seen, included})
+        for beside in {folder, path.parent} if element.tag == "include" else ():
+            included = (beside / get("file", "")).resolve()
+            if included not in seen:
+                check_mjcf(included, folder, error, {*seen, included})
 
 
 def require_private(path: str | Path, about: os.stat_result) -> None:

@@ -627,6 +627,69 @@ def test_misspelt_tables_are_refused(put, line, sentence):
     assert refused(lambda: check(path, draft(path).text + line)) == sentence
 
 
+def with_hind_legs(text: str) -> str:
+    """The same with two further legs behind it."""
+    leg = re.search(r'<body name="left_hip_pitch_link".*?(?=<body name="right_hip_pitch_link")', text, re.DOTALL)[0]
+    hind = [("hl", 0.09), ("hr", -0.09)]
+    legs = "".join(leg.replace("left_", f"{x}_").replace("0 0.09 -0.06", f"-.4 {y} -.06") for x, y in hind)
+    motors = "".join(re.search(r"(<motor.*?)<motor joint=.left_sh", text)[1].replace("left", x) for x, _ in hind)
+    return changed(text, ('<body name="left_arm_link"', legs + '<body name="left_arm_link"'),
+                   ("</actuator>", motors + "</actuator>"))  # fmt: skip
+
+
+FOOT = '<geom type="box" pos="0.03 0 -0.05" size="0.1 0.04 0.015" mass="0"/>'
+CORNERS = " ".join(f"{x} {y} {z}" for x in (-100, 100) for y in (-40, 40) for z in (-15, 15))
+MESH = f'<asset><mesh name="foot" vertex="{CORNERS}"/></asset><worldbody>'
+CAUSES = {
+    "MJCF in rad": ([("angle=\"radian\" ", "")], "is 0.07 rad; an MJCF has its angles in degrees"),
+    "mesh in mm": (
+        [("<worldbody>", MESH), (FOOT, '<geom type="mesh" mesh="foot" pos="0 0 0" mass="0"/>')],
+        "the sole of the foot 'left_ankle_roll_link' measures 200 m (from its mesh), the leg 0.62 m; are its shapes",
+    ),
+    "includes itself": ([("<actuator>", '<include file="a.xml"/><actuator>')], "File 'a.xml' already included"),
+    "turn in degrees": ([('xyz="0 0.09 -0.06"', 'xyz="0 0.09 -0.06" rpy="0 0 90"')], "is beyond a turn: degrees?"),
+    "argument of a template": ([('value="12"', 'value="$(arg kg)"')], "is a xacro template; expand it first"),
+}
+
+
+@pytest.mark.parametrize(("pairs", "sentence"), CAUSES.values(), ids=CAUSES)
+def test_the_true_cause_is_told(put, pairs, sentence):
+    base, name = (MJCF, "a.xml") if pairs[0][0] in MJCF else (URDF, "a.urdf")
+    assert sentence in refused(lambda: draft(put(changed(base, *pairs), name)))
+
+
+def test_four_legs_are_refused(put):
+    path = put(with_hind_legs(MJCF), "a.xml")
+    assert "four legs end on the ground, with the joints 'hr_ankle_roll'" in refused(lambda: draft(path))
+
+
+SLIDES = "".join(
+    f'<link name="{a}"/><joint name="{a}{b}" type="{kind}"><parent link="{a}"/><child link="{b}"/></joint>'
+    for a, b, kind in (("world", "x", "prismatic"), ("x", "pelvis", "continuous"))
+)
+SAME = {
+    "left-over world": (('<link name="pelvis">', '<link name="world"/><link name="pelvis">'), "is joined to nothing"),
+    "joints at the world": (('<link name="pelvis">', SLIDES + '<link name="pelvis">'), ""),
+    "inertias of 0": (('ixx="0.01" iyy="0.01" izz="0.005"', 'ixx="0" iyy="0" izz="0"'), "masses count as points"),
+}
+
+
+@pytest.mark.parametrize(("pair", "note"), SAME.values(), ids=SAME)
+def test_what_does_no_harm_is_left_out(put, pair, note):
+    path = put(changed(URDF, pair))
+    assert note in notes(path) and examine(path).robot.total_mass == pytest.approx(30.8)
+
+
+def test_includes_beside_the_file_that_includes_them_and_in_chinese_encodings(put, tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "robot.xml").write_text(MJCF)
+    (tmp_path / "sub" / "mid.xml").write_text('<mujoco><include file="robot.xml"/></mujoco>')
+    path = put('<mujoco model="scene"><include file="sub/mid.xml"/></mujoco>', "scene.xml")
+    assert parse(read_urdf(path), "x").get("name") == "mini"
+    text = '<?xml version="1.0" encoding="GBK"?>' + MJCF.replace("left_", "左")
+    assert limit(put(text.encode("gbk"), "b.xml"), "左knee") == 160
+
+
 @pytest.mark.parametrize("name", ["base\\pelvis", 'base "A"', "骨盆", "a.b", "{a}", "100%"])
 def test_any_name_is_written_as_valid_toml(put, name):
     path = put(URDF.replace('"pelvis"', f'"{name.replace(chr(34), "&quot;")}"'))

@@ -75,9 +75,9 @@ def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     """
     # MuJoCo would write its warnings into a file of the working folder
     mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
-    texts = dict(_included(path.parent, text))
+    texts = dict(_included(path, text))
     # MuJoCo reads only files that are called so; what they include may lie in other folders
-    plain = path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64])
+    plain = path.suffix in (".xml", ".urdf") and path.read_bytes() == text.encode()
     while True:
         try:
             if plain:
@@ -104,13 +104,20 @@ def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
             notes.append(f"<{tag}> has {key!r}, which this MuJoCo does not know: left out")
 
 
-def _included(folder: Path, text: str) -> Iterator[tuple[str, str]]:
+def _included(path: Path, text: str) -> Iterator[tuple[str, str]]:
     """Names and contents of the files that a text includes, and of those that they include."""
-    for name in re.findall(r"<include\s[^>]*file\s*=\s*[\"']([^\"']+)", text):
-        if (folder / name).is_file():
-            inner = (folder / name).read_text("utf-8", "replace")
-            yield name, inner
-            yield from _included(folder, inner)
+    todo = [(path.parent, text)]
+    seen = {path.resolve()}
+    for folder, outer in todo:
+        for name in re.findall(r"<include\s[^>]*file\s*=\s*[\"']([^\"']+)", outer):
+            # beside the first file, or beside the one that includes it
+            files = (path.parent / name, folder / name)
+            file = next((x.resolve() for x in files if x.is_file()), None)
+            if file is not None and file not in seen:
+                inner = file.read_text("utf-8", "replace")
+                seen.add(file)
+                todo.append((file.parent, inner))
+                yield name, inner
 
 
 def _sentence(e: Exception) -> str:
@@ -122,7 +129,7 @@ def _sentence(e: Exception) -> str:
 def _name(spec: mujoco.MjSpec, path: Path, text: str) -> str:
     """The robot's name: of the model, of a file that it includes, else of file or folder."""
     inner = [spec.modelname if spec.modelname != UNNAMED else ""]
-    for _, part in _included(path.parent, text):
+    for _, part in _included(path, text):
         inner += re.findall(r"<mujoco\s[^>]*model\s*=\s*\"([^\"]+)", part)
     names = (GENERIC.sub("", name) for name in (*inner, path.stem, path.resolve().parent.name))
     return next((name for name in names if name.strip(" _-")), path.stem)

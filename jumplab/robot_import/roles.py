@@ -214,6 +214,18 @@ class _Finder:
         pairs = [pair for pair in pairs if self.along(pair[0][0]) and pair[1][0]]
         return min(pairs, key=lambda pair: self.at[pair[0][0][2]] @ self.up, default=[])
 
+    def refuse_four(self) -> None:
+        """Raise if other limbs stand as well: arms end higher."""
+        firsts = {chain[0] for _, chain in self.legs}
+        for limb in self.limbs():
+            other = all(self.along(self.triple(chain)) for chain in limb)
+            if other and not firsts & {joint for chain in limb for joint in chain}:
+                names = listed(x[-1].name for x in (*limb, *(chain for _, chain in self.legs)))
+                raise self.tree.error(
+                    f"four legs end on the ground, with the joints {names}: jumps are planned for "
+                    f"robots with two"
+                )
+
     def foot(self, three: tuple[Joint, ...], chain: Chain) -> str:
         """The link that stands: behind the ankle, before any toe joint (a further pitch joint)."""
         _, knee, ankle = (self.at[joint] for joint in three)
@@ -326,6 +338,7 @@ def find_roles(tree: Tree) -> Roles:
     """Legs, knees, feet, arms and forward direction; else a :class:`RobotError` says why."""
     finders = (_Finder(tree, guess) for guess in GUESSES)
     finder = next((finder for finder in finders if finder.legs), None) or _explain(tree)
+    finder.refuse_four()
     for three, _ in finder.legs:
         refuse_wheel(tree, three[2])
     notes = []

@@ -179,15 +179,26 @@ def parse(text: str, where: str) -> ET.Element:
     # a "${...}" in a simulator's plug-in or a call left over beside whole links does no harm
     parts = [e for kind in ("link", "joint") for part in root.findall(kind) for e in part.iter()]
     left = any("xacro" in e.tag for e in parts or root.iter())
-    if left or any("${" in v for e in parts for v in e.attrib.values()):
+    if left or any("${" in v or "$(" in v for e in parts for v in e.attrib.values()):
         raise RobotError(xacro)
     if root.tag != "robot":
         what = ROOTS.get(root.tag, "a URDF begins with <robot>")
         raise RobotError(f"{where}: the root element is <{root.tag}>, {what}")
+    _drop_lone_links(root)
     if late:
         words = "the XML declaration stands behind a comment or a space, and is ignored"
         ET.SubElement(root, "note", text=words)
     return root
+
+
+def _drop_lone_links(root: ET.Element) -> None:
+    """Take out links without mass that no joint joins to anything, such as a left-over world."""
+    joined = {end.get("link") for joint in root.findall("joint") for end in joint}
+    for link in root.findall("link") if joined else ():
+        if link.get("name") not in joined and not len(link):
+            root.remove(link)
+            words = f"the link {link.get('name')!r} is joined to nothing, and left out"
+            ET.SubElement(root, "note", text=words)
 
 
 # numbers of elements
