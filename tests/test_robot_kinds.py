@@ -28,6 +28,7 @@ KNEE = '<motor joint="left_knee" ctrlrange="-160 160"/>'
 PELVIS = '<body name="pelvis" pos="0 0 .75"><freejoint/>'
 BOX = '<collision><origin xyz="0.03 0 -0.05"/><geometry><box size="0.2 0.08 0.03"/></geometry></collision>'
 SOLE = pytest.approx((-0.07, 0.13, -0.065))
+SOLE_X = pytest.approx((-0.07, 0.13))
 TOLD = "\n".join(f"[limits.{role}]\nvelocity = 20.0" for role in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"))
 TOLD += "".join(
     f"\n[limits.{side}_{name}]\nvelocity = 20.0"
@@ -113,13 +114,16 @@ MOTORS = {
     "one each way": (('ctrlrange="-160 0"', 'ctrlrange="0 160"'), 160),
     "one way only": (('ctrlrange="0 160"',), 0),
     "weaker way": (('ctrlrange="-160 160" forcerange="-60 100"',), 60),
+    "beside a damper": (('ctrlrange="-160 160"/><damper kv="3" joint="left_knee" ctrlrange="0 1"',), 160),
+    "beside one that is off": (('ctrlrange="-160 160"/><position kp="9" joint="left_knee" group="2"',), 160),
 }
 
 
 @pytest.mark.parametrize(("kinds", "effort"), MOTORS.values(), ids=MOTORS)
 def test_torque_of_motors(put, kinds, effort):
     motors = "".join(f'<motor joint="left_knee" {kind}/>' for kind in kinds)
-    assert limit(put(changed(MJCF, (KNEE, motors)), "a.xml"), "left_knee") == effort
+    off = ("<worldbody>", '<option actuatorgroupdisable="2"/><worldbody>')
+    assert limit(put(changed(MJCF, (KNEE, motors), off), "a.xml"), "left_knee") == effort
 
 
 def test_servos_tell_no_torque_but_by_their_force_range(put):
@@ -648,6 +652,10 @@ CAUSES = {
     ),
     "includes itself": ([("<actuator>", '<include file="a.xml"/><actuator>')], "File 'a.xml' already included"),
     "turn in degrees": ([('xyz="0 0.09 -0.06"', 'xyz="0 0.09 -0.06" rpy="0 0 90"')], "is beyond a turn: degrees?"),
+    "telescopic knees": (
+        [('knee" axis="0 1 0" range="0.0 2.3"', 'knee" type="slide" axis="0 0 1" range="-.1 .1"')],
+        "('left_hip_pitch', 'left_ankle_pitch'), and 'left_knee' is prismatic there",
+    ),
     "argument of a template": ([('value="12"', 'value="$(arg kg)"')], "is a xacro template; expand it first"),
 }
 
@@ -656,6 +664,22 @@ CAUSES = {
 def test_the_true_cause_is_told(put, pairs, sentence):
     base, name = (MJCF, "a.xml") if pairs[0][0] in MJCF else (URDF, "a.urdf")
     assert sentence in refused(lambda: draft(put(changed(base, *pairs), name)))
+
+
+def test_a_longer_leg_is_told(put):
+    text = re.sub(r'(<joint name="left_ankle_pitch".*?xyz="0 0 )-0.31', r"\1-0.35", URDF)
+    assert "and 'right_ankle_roll' end 40 mm from where mirror images do" in refused(lambda: draft(put(text)))
+
+
+@pytest.mark.parametrize("name", [r"meshes\foot.stl", "meshes/FOOT.STL", "my%20meshes/foot.stl", "$(find a)/foot.stl"])
+def test_meshes_are_found_however_they_are_written(put, tmp_path, name):
+    corners = [(a, b, c) for a in (-0.1, 0.1) for b in (-0.04, 0.04) for c in (-0.015, 0.015)]
+    facets = [struct.pack("<12fH", 0, 0, 0, *corners[i], *corners[i - 1], *corners[i - 3], 0) for i in range(8)]
+    for folder in ("meshes", "my meshes", "a"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "foot.stl").write_bytes(bytes(80) + struct.pack("<I", 8) + b"".join(facets))
+    path = put(URDF.replace('<box size="0.2 0.08 0.03"/>', f'<mesh filename="{name}"/>'))
+    assert draft(path).sole.x == SOLE_X and "from its mesh" in draft(path).sole.source
 
 
 def test_four_legs_are_refused(put):

@@ -447,18 +447,29 @@ def _explain(tree: Tree) -> NoReturn:
                     f"both legs must have the same joints"
                 )
     finder = _Finder(tree, GUESSES[0])
-    hanging = {chain[-1].name for chain in finder.tips if finder.along(finder.triple(chain))}
+    hanging = {chain[-1]: 0 for chain in finder.tips if finder.along(finder.triple(chain))}
     if len(hanging) == 1:
         raise tree.error(
-            f"one leg only: the chain that ends with joint {hanging.pop()!r} has no "
+            f"one leg only: the chain that ends with joint {next(iter(hanging)).name!r} has no "
             f"mirror image among {len(tree.elements)} links; a jumper needs two legs"
+        )
+    if len(hanging) == 2:
+        one, other = hanging
+        apart = np.abs(finder.at[one] - finder.at[other]) * (1 - np.abs(finder.lateral))
+        raise tree.error(
+            f"the legs that end with the joints {one.name!r} and {other.name!r} end "
+            f"{1e3 * norm(apart):.0f} mm from where mirror images do, {1e3 * SAME_M:.0f} mm or "
+            f"more is another robot's leg; correct the origins of one"
         )
     limbs = [chain for pair in finder.limbs() for chain in pair[::-1]]
     best = max(map(finder.pitch, limbs or finder.tips), key=len, default=[])
     shown = ", ".join(repr(j.name) for j in best[:4]) or "none"
+    way = tree.chain(best[-1].child) if best else []
+    others = [f"{j.name!r} is {j.kind}" for j in way if j.kind in ("prismatic", "floating")]
     raise tree.error(
         f"no pair of mirrored legs with three revolute pitch joints (hip, knee, "
         f"ankle) was found; the most on one chain about +-y are {len(best)} ({shown})"
+        + "".join(f", and {x} there" for x in others[:1])
     )
 
 
@@ -495,7 +506,7 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
         leg_m = float(norm((turn @ (hip - ankle))[[0, 2]]))
         sole = find_sole(tree, roles.feet[0], turn, leg_m)
     except RobotError as e:
-        for note in notes(tree):
+        for note in (*notes(tree), *dict.fromkeys(tree.notes)):
             e.add_note(note)
         raise
     assumed = "".join(
