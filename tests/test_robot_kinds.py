@@ -625,10 +625,11 @@ def test_what_is_advised_is_enough(put):
     ("[limts.knee]\neffort = 1.0", "robot configuration: [limts] is unknown; did you mean limits?"),
     ("[shapes]\ntigh_thickness_m = 0.1", "robot configuration: [shapes] 'tigh_thickness_m' is unknown; "
                                          "did you mean thigh_thickness_m?"),
+    ("[locked]", "; put its lines into the one that is there"),
 ])  # fmt: skip
 def test_misspelt_tables_are_refused(put, line, sentence):
     path = put(URDF)
-    assert refused(lambda: check(path, draft(path).text + line)) == sentence
+    assert refused(lambda: check(path, draft(path).text + line)).endswith(sentence)
 
 
 def with_hind_legs(text: str) -> str:
@@ -712,6 +713,12 @@ def test_includes_beside_the_file_that_includes_them_and_in_chinese_encodings(pu
     assert parse(read_urdf(path), "x").get("name") == "mini"
     text = '<?xml version="1.0" encoding="GBK"?>' + MJCF.replace("left_", "左")
     assert limit(put(text.encode("gbk"), "b.xml"), "左knee") == 160
+
+
+def test_a_robot_is_called_like_a_file(put):
+    path = put(URDF)
+    text = draft(path).text.replace('name = "mini"', 'name = "../x"')
+    assert "'name' = '../x' must be a plain file name" in refused(lambda: check(path, text))
 
 
 @pytest.mark.parametrize("name", ["base\\pelvis", 'base "A"', "骨盆", "a.b", "{a}", "100%"])
