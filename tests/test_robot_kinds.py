@@ -657,6 +657,10 @@ CAUSES = {
         [('knee" axis="0 1 0" range="0.0 2.3"', 'knee" type="slide" axis="0 0 1" range="-.1 .1"')],
         "('left_hip_pitch', 'left_ankle_pitch'), and 'left_knee' is prismatic there",
     ),
+    "legs in the middle": (
+        [(f'xyz="0 {y} -0.06"', 'xyz="0 0 -0.06"') for y in (0.09, -0.09)],
+        "'right_ankle_roll' are none to the left and none to the right of the trunk",
+    ),
     "argument of a template": ([('value="12"', 'value="$(arg kg)"')], "is a xacro template; expand it first"),
 }
 

@@ -455,11 +455,14 @@ def _explain(tree: Tree) -> NoReturn:
         )
     if len(hanging) == 2:
         one, other = hanging
-        apart = np.abs(finder.at[one] - finder.at[other]) * (1 - np.abs(finder.lateral))
+        legs = f"the legs that end with the joints {one.name!r} and {other.name!r}"
+        gap = finder.at[one] - finder.at[other]
+        if abs(gap @ finder.lateral) < SAME_M:
+            raise tree.error(f"{legs} are none to the left and none to the right of the trunk")
+        apart = 1e3 * norm(gap * (1 - np.abs(finder.lateral)))
         raise tree.error(
-            f"the legs that end with the joints {one.name!r} and {other.name!r} end "
-            f"{1e3 * norm(apart):.0f} mm from where mirror images do, {1e3 * SAME_M:.0f} mm or "
-            f"more is another robot's leg; correct the origins of one"
+            f"{legs} end {apart:.0f} mm from where mirror images do, {1e3 * SAME_M:.0f} mm or more "
+            f"is another robot's leg; correct the origins of one"
         )
     limbs = [chain for pair in finder.limbs() for chain in pair[::-1]]
     best = max(map(finder.pitch, limbs or finder.tips), key=len, default=[])
