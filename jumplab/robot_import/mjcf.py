@@ -647,7 +647,7 @@ class _Writer:
             add(follower, "mimic", joint=leader, multiplier=factor, offset=offset)
 
     def note_what_is_left_out(self) -> None:
-        """Springs, tendons, what bears weight, and actuators that act on no joint."""
+        """Springs, tendons, compensation of gravity, and actuators that act on no joint."""
         model = self.model
         counted = self._joints(k for k in self.joints if self.ref[k])
         springs = self._joints(k for k in self.joints if model.jnt_stiffness[k])
