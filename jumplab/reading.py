@@ -32,6 +32,7 @@ MOST_TAGS = 100_000  # of an XML text; the largest published robot has some 5000
 MOST_COPIES = 1000  # that an MJCF file asks for
 MOST_POINTS = 4_000_000  # of a height field
 COPYING = ("replicate", "composite", "flexcomp")
+INCLUDING = ("include", "model")  # elements of an MJCF that name another one
 # [bytes] of a file, by what it is: several times the largest that this package or a publisher of
 # robots makes; in words; what to do
 KINDS = {
@@ -147,7 +148,7 @@ def check_mjcf(
                 f"most {most} are read; remove it, or ask for fewer"
             )
         todo += [(child, above * copies) for child in element]
-        for beside in {folder, path.parent} if element.tag == "include" else ():
+        for beside in {folder, path.parent} if element.tag in INCLUDING else ():
             included = (beside / get("file", "")).resolve()
             if included not in seen:
                 check_mjcf(included, folder, error, {*seen, included})

@@ -715,6 +715,10 @@ def test_includes_beside_the_file_that_includes_them_and_in_chinese_encodings(pu
     (tmp_path / "sub" / "mid.xml").write_text('<mujoco><include file="robot.xml"/></mujoco>')
     path = put('<mujoco model="scene"><include file="sub/mid.xml"/></mujoco>', "scene.xml")
     assert parse(read_urdf(path), "x").get("name") == "mini"
+    attached = '<asset><model name="r" file="sub/robot.xml"/></asset><worldbody><frame><attach model="r" body="pelvis"'
+    for name in ("host.xml", "host.mjcf"):  # MuJoCo reads only the first by itself
+        path = put(f'<mujoco>{attached} prefix="r_"/></frame></worldbody></mujoco>', name)
+        assert limit(path, "r_left_knee") == 160
     text = '<?xml version="1.0" encoding="GBK"?>' + MJCF.replace("left_", "左")
     assert limit(put(text.encode("gbk"), "b.xml"), "左knee") == 160
 

@@ -109,11 +109,11 @@ def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
 
 
 def _included(path: Path, text: str) -> Iterator[tuple[str, str]]:
-    """Names and contents of the files that a text includes, and of those that they include."""
+    """Names and contents of the files that a text includes or attaches, and of those in them."""
     todo = [(path.parent, text)]
     seen = {path.resolve()}
     for folder, outer in todo:
-        for name in re.findall(r"<include\s[^>]*file\s*=\s*[\"']([^\"']+)", outer):
+        for name in re.findall(r"<(?:include|model)\s[^>]*file\s*=\s*[\"']([^\"']+)", outer):
             # beside the first file, or beside the one that includes it
             files = (path.parent / name, folder / name)
             file = next((x.resolve() for x in files if x.is_file()), None)
