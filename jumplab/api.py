@@ -86,7 +86,7 @@ def plan(
     robust : ranges of the perturbed robots that the plan allows for, such as
         ``jumplab.sim.Ranges()``, see :mod:`jumplab.studies.robust`.
     patience_s : processor time after which planning ends, with the best that was found or a refusal
-        [s]; an easier target is looked for in what is left of it, and a fifth more. By default 20 a
+        [s]; an easier target is looked for in what is left of it, and a tenth more. By default 20 a
         start, 40 for a schedule or a jump like a clip, and 120 for a robust plan.
     starts : how many starts are tried to the end, of which the cheapest plan counts; its
         ``attempts`` say how the others differ. See :meth:`jumplab.Planner.plan`.

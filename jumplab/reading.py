@@ -32,6 +32,7 @@ MOST_TAGS = 100_000  # of an XML text; the largest published robot has some 5000
 MOST_COPIES = 1000  # that an MJCF file asks for
 MOST_POINTS = 4_000_000  # of a height field
 COPYING = ("replicate", "composite", "flexcomp")
+INCLUDING = ("include", "model")  # elements of an MJCF that name another one
 # [bytes] of a file, by what it is: several times the largest that this package or a publisher of
 # robots makes; in words; what to do
 KINDS = {
@@ -125,9 +126,14 @@ def check_mjcf(
     MuJoCo itself has no such limits. Files that are no XML are left to it.
     """
     try:
-        todo = [(xml(content(path, "robot", error=error), path.name, error), 1)]
+        raw = content(path, "robot", error=error)
+        try:
+            root = xml(raw, path.name, error)
+        except (ValueError, LookupError):  # an encoding that is not known here; its tags are ASCII
+            root = xml(raw.decode("latin-1"), path.name, error)
     except (OSError, ElementTree.ParseError):
         return
+    todo = [(root, 1)]
     for element, above in todo:
         get = element.get
         numbers = [get("count")] if element.tag in COPYING else []
@@ -142,9 +148,10 @@ def check_mjcf(
                 f"most {most} are read; remove it, or ask for fewer"
             )
         todo += [(child, above * copies) for child in element]
-        included = (folder / get("file", "")).resolve()
-        if element.tag == "include" and included not in seen:
-            check_mjcf(included, folder, error, {*seen, included})
+        for beside in {folder, path.parent} if element.tag in INCLUDING else ():
+            included = (beside / get("file", "")).resolve()
+            if included not in seen:
+                check_mjcf(included, folder, error, {*seen, included})
 
 
 def require_private(path: str | Path, about: os.stat_result) -> None:

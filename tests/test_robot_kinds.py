@@ -28,6 +28,7 @@ KNEE = '<motor joint="left_knee" ctrlrange="-160 160"/>'
 PELVIS = '<body name="pelvis" pos="0 0 .75"><freejoint/>'
 BOX = '<collision><origin xyz="0.03 0 -0.05"/><geometry><box size="0.2 0.08 0.03"/></geometry></collision>'
 SOLE = pytest.approx((-0.07, 0.13, -0.065))
+SOLE_X = pytest.approx((-0.07, 0.13))
 TOLD = "\n".join(f"[limits.{role}]\nvelocity = 20.0" for role in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"))
 TOLD += "".join(
     f"\n[limits.{side}_{name}]\nvelocity = 20.0"
@@ -113,13 +114,16 @@ MOTORS = {
     "one each way": (('ctrlrange="-160 0"', 'ctrlrange="0 160"'), 160),
     "one way only": (('ctrlrange="0 160"',), 0),
     "weaker way": (('ctrlrange="-160 160" forcerange="-60 100"',), 60),
+    "beside a damper": (('ctrlrange="-160 160"/><damper kv="3" joint="left_knee" ctrlrange="0 1"',), 160),
+    "beside one that is off": (('ctrlrange="-160 160"/><position kp="9" joint="left_knee" group="2"',), 160),
 }
 
 
 @pytest.mark.parametrize(("kinds", "effort"), MOTORS.values(), ids=MOTORS)
 def test_torque_of_motors(put, kinds, effort):
     motors = "".join(f'<motor joint="left_knee" {kind}/>' for kind in kinds)
-    assert limit(put(changed(MJCF, (KNEE, motors)), "a.xml"), "left_knee") == effort
+    off = ("<worldbody>", '<option actuatorgroupdisable="2"/><worldbody>')
+    assert limit(put(changed(MJCF, (KNEE, motors), off), "a.xml"), "left_knee") == effort
 
 
 def test_servos_tell_no_torque_but_by_their_force_range(put):
@@ -363,6 +367,10 @@ def test_losses_of_the_file_are_those_of_the_motors(put):
     assert examine(urdf).robot.actuators["left_knee"]["damping"] == 0.5
     assert "friction = '-1' of 'left_hip_pitch', 'left_knee', 'right_hip_pitch', 'right_knee' must be" in notes(urdf)
     assert "armature = " not in notes(urdf)
+    # of 160 N m at 20 rad/s: what leaves less than a tenth is the line on which the torque falls
+    for damping, used in ((6.9, 6.9), (7.4, 0.0)):
+        knee = re.sub('(effort="160" velocity="20"/>)', rf'\1<dynamics damping="{damping}"/>', URDF)
+        assert examine(put(knee)).robot.actuators["left_knee"]["damping"] == used
 
 
 def test_what_another_version_or_another_file_has_is_left_out(put):
@@ -621,10 +629,108 @@ def test_what_is_advised_is_enough(put):
     ("[limts.knee]\neffort = 1.0", "robot configuration: [limts] is unknown; did you mean limits?"),
     ("[shapes]\ntigh_thickness_m = 0.1", "robot configuration: [shapes] 'tigh_thickness_m' is unknown; "
                                          "did you mean thigh_thickness_m?"),
+    ("[locked]", "; put its lines into the one that is there"),
 ])  # fmt: skip
 def test_misspelt_tables_are_refused(put, line, sentence):
     path = put(URDF)
-    assert refused(lambda: check(path, draft(path).text + line)) == sentence
+    assert refused(lambda: check(path, draft(path).text + line)).endswith(sentence)
+
+
+def with_hind_legs(text: str) -> str:
+    """The same with two further legs behind it."""
+    leg = re.search(r'<body name="left_hip_pitch_link".*?(?=<body name="right_hip_pitch_link")', text, re.DOTALL)[0]
+    hind = [("hl", 0.09), ("hr", -0.09)]
+    legs = "".join(leg.replace("left_", f"{x}_").replace("0 0.09 -0.06", f"-.4 {y} -.06") for x, y in hind)
+    motors = "".join(re.search(r"(<motor.*?)<motor joint=.left_sh", text)[1].replace("left", x) for x, _ in hind)
+    return changed(text, ('<body name="left_arm_link"', legs + '<body name="left_arm_link"'),
+                   ("</actuator>", motors + "</actuator>"))  # fmt: skip
+
+
+FOOT = '<geom type="box" pos="0.03 0 -0.05" size="0.1 0.04 0.015" mass="0"/>'
+CORNERS = " ".join(f"{x} {y} {z}" for x in (-100, 100) for y in (-40, 40) for z in (-15, 15))
+MESH = f'<asset><mesh name="foot" vertex="{CORNERS}"/></asset><worldbody>'
+CAUSES = {
+    "MJCF in rad": ([("angle=\"radian\" ", "")], "is 0.07 rad; an MJCF has its angles in degrees"),
+    "mesh in mm": (
+        [("<worldbody>", MESH), (FOOT, '<geom type="mesh" mesh="foot" pos="0 0 0" mass="0"/>')],
+        "the sole of the foot 'left_ankle_roll_link' measures 200 m (from its mesh), the leg 0.62 m; are its shapes",
+    ),
+    "includes itself": ([("<actuator>", '<include file="a.xml"/><actuator>')], "File 'a.xml' already included"),
+    "turn in degrees": ([('xyz="0 0.09 -0.06"', 'xyz="0 0.09 -0.06" rpy="0 0 90"')], "is beyond a turn: degrees?"),
+    "telescopic knees": (
+        [('knee" axis="0 1 0" range="0.0 2.3"', 'knee" type="slide" axis="0 0 1" range="-.1 .1"')],
+        "('left_hip_pitch', 'left_ankle_pitch'), and 'left_knee' is prismatic there",
+    ),
+    "legs in the middle": (
+        [(f'xyz="0 {y} -0.06"', 'xyz="0 0 -0.06"') for y in (0.09, -0.09)],
+        "'right_ankle_roll' are none to the left and none to the right of the trunk",
+    ),
+    "argument of a template": ([('value="12"', 'value="$(arg kg)"')], "is a xacro template; expand it first"),
+}
+
+
+@pytest.mark.parametrize(("pairs", "sentence"), CAUSES.values(), ids=CAUSES)
+def test_the_true_cause_is_told(put, pairs, sentence):
+    base, name = (MJCF, "a.xml") if pairs[0][0] in MJCF else (URDF, "a.urdf")
+    assert sentence in refused(lambda: draft(put(changed(base, *pairs), name)))
+
+
+def test_a_longer_leg_is_told(put):
+    text = re.sub(r'(<joint name="left_ankle_pitch".*?xyz="0 0 )-0.31', r"\1-0.35", URDF)
+    assert "and 'right_ankle_roll' end 40 mm from where mirror images do" in refused(lambda: draft(put(text)))
+
+
+@pytest.mark.parametrize("name", [r"meshes\foot.stl", "meshes/FOOT.STL", "my%20meshes/foot.stl", "$(find a)/foot.stl"])
+def test_meshes_are_found_however_they_are_written(put, tmp_path, name):
+    corners = [(a, b, c) for a in (-0.1, 0.1) for b in (-0.04, 0.04) for c in (-0.015, 0.015)]
+    facets = [struct.pack("<12fH", 0, 0, 0, *corners[i], *corners[i - 1], *corners[i - 3], 0) for i in range(8)]
+    for folder in ("meshes", "my meshes", "a"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "foot.stl").write_bytes(bytes(80) + struct.pack("<I", 8) + b"".join(facets))
+    path = put(URDF.replace('<box size="0.2 0.08 0.03"/>', f'<mesh filename="{name}"/>'))
+    assert draft(path).sole.x == SOLE_X and "from its mesh" in draft(path).sole.source
+
+
+def test_four_legs_are_refused(put):
+    path = put(with_hind_legs(MJCF), "a.xml")
+    assert "four legs end on the ground, with the joints 'hr_ankle_roll'" in refused(lambda: draft(path))
+
+
+SLIDES = "".join(
+    f'<link name="{a}"/><joint name="{a}{b}" type="{kind}"><parent link="{a}"/><child link="{b}"/></joint>'
+    for a, b, kind in (("world", "x", "prismatic"), ("x", "pelvis", "continuous"))
+)
+SAME = {
+    "left-over world": (('<link name="pelvis">', '<link name="world"/><link name="pelvis">'), "is joined to nothing"),
+    "joints at the world": (('<link name="pelvis">', SLIDES + '<link name="pelvis">'), ""),
+    "inertias of 0": (('ixx="0.01" iyy="0.01" izz="0.005"', 'ixx="0" iyy="0" izz="0"'), "masses count as points"),
+}
+
+
+@pytest.mark.parametrize(("pair", "note"), SAME.values(), ids=SAME)
+def test_what_does_no_harm_is_left_out(put, pair, note):
+    path = put(changed(URDF, pair))
+    assert note in notes(path) and examine(path).robot.total_mass == pytest.approx(30.8)
+
+
+def test_includes_beside_the_file_that_includes_them_and_in_chinese_encodings(put, tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "robot.xml").write_text(MJCF)
+    (tmp_path / "sub" / "mid.xml").write_text('<mujoco><include file="robot.xml"/></mujoco>')
+    path = put('<mujoco model="scene"><include file="sub/mid.xml"/></mujoco>', "scene.xml")
+    assert parse(read_urdf(path), "x").get("name") == "mini"
+    attached = '<asset><model name="r" file="sub/robot.xml"/></asset><worldbody><frame><attach model="r" body="pelvis"'
+    for name in ("host.xml", "host.mjcf"):  # MuJoCo reads only the first by itself
+        path = put(f'<mujoco>{attached} prefix="r_"/></frame></worldbody></mujoco>', name)
+        assert limit(path, "r_left_knee") == 160
+    text = '<?xml version="1.0" encoding="GBK"?>' + MJCF.replace("left_", "左")
+    assert limit(put(text.encode("gbk"), "b.xml"), "左knee") == 160
+
+
+def test_a_robot_is_called_like_a_file(put):
+    path = put(URDF)
+    text = draft(path).text.replace('name = "mini"', 'name = "../x"')
+    assert "'name' = '../x' must be a plain file name" in refused(lambda: check(path, text))
 
 
 @pytest.mark.parametrize("name", ["base\\pelvis", 'base "A"', "骨盆", "a.b", "{a}", "100%"])

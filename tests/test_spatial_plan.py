@@ -35,7 +35,7 @@ from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Contacts, Limits, Mesh, Place, Weights, WholeBodyPlanner
 from jumplab.stages.whole_body import plan as ended
 from jumplab.stages.whole_body import planner as planning
-from jumplab.stages.whole_body.apart import MORE_M, face_gaps, merged, placed, too_close, used_apart
+from jumplab.stages.whole_body.apart import MORE_M, NODES, face_gaps, merged, placed, too_close, used_apart
 from jumplab.stages.whole_body.between import (
     ACCELERATION_GAP,
     CLEAR_M,
@@ -54,7 +54,7 @@ from jumplab.stages.whole_body.instant import Instant
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.program import FINER, Program
 from jumplab.stages.whole_body.shapes import ROUNDED_M, Apart, Pair
-from jumplab.stages.whole_body.starts import COLD, FROM_NEIGHBOUR
+from jumplab.stages.whole_body.starts import COLD, FROM_NEIGHBOUR, Asked, unpassed
 from jumplab.stages.whole_body.tape import AIR, FLAT, TOE, pressed
 from jumplab.task import JumpTask
 
@@ -675,10 +675,21 @@ def test_links_that_meet_are_kept_where_they_were(bhr, pitch, roll, links, axis)
         q[:, BASE + bhr.joint_names.index(f"{side}_hip_roll")] += sign * roll * way
     still = np.zeros_like(q)
     motion = PhaseSolution(np.linspace(0, 1, 13), q, still, still, still[1:], still[:, :1], 1.0, {})
-    pairs = [x.pair for x in too_close(body, [motion], 0.003)]
+    rows = too_close(body, [motion], 0.003)
+    pairs = [x.pair for x in rows]
     kinds = {f"left_{name}_0" if "_" not in name else name for name in links.split()}
     found = [pair.face // 2 for pair in pairs if kinds <= {pair.first.name, pair.second.name}]
     assert found and set(found) == {axis}
+    # where they cannot pass each other, they are kept apart as just before they met
+    program = WholeBodyPlanner(bhr, body=body).usual
+    kept = unpassed(program, Asked(SIDE), [replace(x, more_m=MORE_M) for x in rows]).apart
+    ends = [(x.first, x.last, x.more_m) for x in kept]
+    assert ends == [(x.first, x.last, 0.0) for x in rows]
+    at = {box.name: k for k, box in enumerate(body.shapes)}
+    boxes = placed(body, body.model.to_pinocchio(q, still, still)[0])
+    for x in kept:
+        gaps = face_gaps(*(boxes[at[box.name]] for box in (x.pair.first, x.pair.second)))[x.pair.face]
+        assert max(gaps[x.first : x.first + NODES + 1]) > 0
 
 
 def test_rows_for_links_that_met_stay_where_they_are_on_another_mesh():

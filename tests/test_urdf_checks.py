@@ -139,7 +139,7 @@ TEXTS = [
     ("cycle", cycle(),
      "the links 'left_ankle_link', 'left_arm', 'left_foot', 'left_hip_roll_link', 'left_hip_yaw_link', 'left_shank' "
      "and 9 more form a cycle: each robot needs one link without a parent"),
-    ("two roots", added('<link name="table"/>'),
+    ("two roots", added('<link name="table"><inertial/></link>'),
      "2 links have no parent ('table', 'trunk'), Pinocchio keeps one tree and drops the rest; connect them"),
     ("island", island(), "the links 'a', 'b' form a cycle apart from the root 'trunk'"),
     # inertials

@@ -173,7 +173,8 @@ def read_toml(text: str, where: str) -> dict:
     try:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as e:
-        raise RobotError(f"{where}: not a TOML file: {e}") from e
+        twice = "; put its lines into the one that is there" if "twice" in str(e) else ""
+        raise RobotError(f"{where}: not a TOML file: {e}{twice}") from e
 
 
 def entry(

@@ -46,6 +46,8 @@ MOST_NM = 2000.0  # five times the strongest published electric humanoid joint
 # twice the fastest published humanoid pitch joint; above it, deg/s or a placeholder
 MOST_RAD_S = 60.0
 MOST_RAD = 4 * np.pi  # two turns; beyond them, degrees or a placeholder
+MOST_TURN_RAD = 6.5  # of an origin, a little more than a turn
+DEGREES_RAD = 0.12  # a whole turn, 6.28 rad, that is taken in degrees
 # of a motor: unit, the most that is meant, what more of it is, what to give
 MOTOR_LIMITS = {
     "effort": ("N m", MOST_NM, "a placeholder", "peak torque"),
@@ -107,14 +109,20 @@ def notes(tree: Tree) -> Iterator[str]:
             name = element.tag.rpartition("}")[2]
             yield f"the call <{name}> of a xacro macro is left over, and ignored"
     yield from (note.get("text") for note in tree.xml.findall("note"))
+    points = []
     for name, link in tree.elements.items():
         if any(numbers(x.get("radius"), 1) == 0 for x in link.findall("collision/geometry/sphere")):
             yield f"link {name!r}: a sphere of radius 0 is taken as a point"
         if mass_of(link) >= FRAME_KG and 0 < (gap := unsolid(tensor_of(link))) <= tree.mended:
-            yield (
-                f"link {name!r}: its inertia, which no solid has, is replaced by the nearest, "
-                f"{gap:.2g} kg m^2 apart"
-            )
+            if np.any(tensor_of(link)):
+                yield (
+                    f"link {name!r}: its inertia, which no solid has, is replaced by the nearest, "
+                    f"{gap:.2g} kg m^2 apart"
+                )
+            else:
+                points.append(name)
+    if points:
+        yield f"the inertias of {listed(points)} are 0: their masses count as points"
     moving = [joint for joint in tree.joints.values() if joint.kind in MOVING]
     followers = {}  # leader -> joints
     for joint in tree.joints.values():
@@ -201,7 +209,11 @@ def _joint_faults(joint: ET.Element, links: set, where: str) -> Iterator[str]:
         yield f"{at}: joins the link {ends[0]!r} to itself; correct parent or child"
     if kind not in TYPES:
         yield f"{at}: type {kind!r} is unknown; URDF has {', '.join(TYPES)}"
-    yield from _triples(joint.find("origin"), f"{at}: origin", "xyz", "rpy")
+    origin = joint.find("origin")
+    yield from _triples(origin, f"{at}: origin", "xyz", "rpy")
+    turn = None if origin is None else numbers(origin.get("rpy"), 3)
+    if turn is not None and np.abs(turn).max() > MOST_TURN_RAD:
+        yield f"{at}: origin rpy = {origin.get('rpy')!r} is beyond a turn: degrees? give rad"
     axis = joint.find("axis")
     if kind in MOVING and axis is not None:
         direction = numbers(axis.get("xyz"), 3)
@@ -306,7 +318,7 @@ def _tensor_faults(link: ET.Element, at: str, most: float, longest: float) -> It
 
 def _massless_bodies(tree: Tree) -> Iterator[str]:
     """Joints that move no mass themselves, though what hangs on them has some; but for those of a
-    body with several.
+    body with several, and of the base, which is free however it is joined to the world.
     """
     remedy = 'or let it have a gram: --repair massless, or [source] repair = ["massless"]'
     for joint in tree.joints.values():
@@ -314,6 +326,8 @@ def _massless_bodies(tree: Tree) -> Iterator[str]:
         at = f"{tree.where}: link {link!r}"
         weighs = tree.body_of(link).mass > 0 or tree.elements[link].get("between")
         if joint.kind == "fixed" or weighs or not tree.carried(link):
+            continue
+        if np.isclose(tree.carried(link), tree.mass):
             continue
         fault = f"mass = 0 kg, the body of joint {joint.name!r} must weigh more than 0 kg"
         if tree.elements[link].find("inertial") is None:
@@ -348,6 +362,19 @@ def _unit_faults(tree: Tree) -> Iterator[str]:
         if not low <= value <= high:
             guess = many if value > high else few
             yield f"{tree.where}: {sentence.format(value, low, high, guess)}"
+    turns = [np.ptp(x) for x in _ranges(tree)]
+    if tree.format == "MJCF" and 0 < max(turns, default=0.0) < DEGREES_RAD:
+        yield (
+            f"{tree.where}: the widest range of a joint is {max(turns):.2g} rad; an MJCF has its "
+            f'angles in degrees: if these are in rad, add <compiler angle="radian"/>'
+        )
+
+
+def _ranges(tree: Tree) -> Iterator[tuple[float, float]]:
+    """Lower and upper stops of the hinges that have both [rad]."""
+    for joint in tree.joints.values():
+        if joint.kind == "revolute" and {"lower", "upper"} <= set(joint.limits):
+            yield joint.limits["lower"], joint.limits["upper"]
 
 
 def length_of(tree: Tree) -> float:

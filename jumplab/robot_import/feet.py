@@ -17,8 +17,9 @@ LEANS_RAD = 1.3  # within which a foot is looked for level, in such steps; a sha
 STEP_RAD = np.pi / 180
 STANDS = 0.1  # sine: a cylinder that leans by less than 6 deg stands on its end
 # shares of the leg's length: shapes smaller than this are markers or points, no soles; and what is
-# so little above the lowest point belongs to the sole, at most SOLE_M
+# so little above the lowest point belongs to the sole, at most SOLE_M; no sole is LONGEST legs long
 SMALLEST = 0.04
+LONGEST = 2.0
 SOLE_SHARE = 0.02
 SOLE_M = 0.012
 # a sole where nothing is known: the default robot's, as shares of the leg's length from hip to
@@ -74,6 +75,13 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
             f"the foot {foot!r} touches the ground in a point ({source}, {wide:.0f} mm wide): it "
             f"has no sole, and jumps are planned for feet that stand flat; give the foot a shape "
             f"with a level lower side"
+        )
+    long = max(np.ptp(touching[:, :2], axis=0))
+    if long > LONGEST * leg_m:
+        raise tree.error(
+            f"the sole of the foot {foot!r} measures {long:.3g} m ({source}), the leg {leg_m:.3g} "
+            f'm; are its shapes in millimetres? give a mesh scale = "0.001 0.001 0.001", or '
+            f"divide their sizes by 1000"
         )
     ends = []
     for axis in range(2):

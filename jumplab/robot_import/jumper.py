@@ -11,6 +11,7 @@ import copy
 import hashlib
 from collections.abc import Sequence
 from itertools import product
+from pathlib import PurePath
 from xml.etree import ElementTree as ET
 
 import coal
@@ -78,6 +79,12 @@ def make_jumper(tree: Tree, config: dict) -> tuple[Robot, Lumped]:
     ``tree`` is that of a URDF, and ``config`` a configuration with a table [source].
     """
     check_entries(config, SOURCE_TABLES)
+    name = entry(config, "name", kind=str)
+    if not name or name.startswith(".") or PurePath(name).name != name:
+        raise RobotError(
+            f"robot configuration: 'name' = {name!r} must be a plain file name: pictures and files "
+            f"of the robot are called so"
+        )
     config = _facing(config)
     source = source_of(config)
     roles = roles_table(config)
@@ -86,7 +93,7 @@ def make_jumper(tree: Tree, config: dict) -> tuple[Robot, Lumped]:
     sole = _sole(tree, config, lumped.place(feet[0]).translation)
     boxes = _boxes(config, roles, lumped, sole)
     _cut_hips(lumped, roles, boxes)
-    text = _urdf(entry(config, "name", kind=str), lumped, roles, boxes)
+    text = _urdf(name, lumped, roles, boxes)
     config_text = _toml(config, roles, feet, sole, tree.text, lumped) + _published(
         tree, lumped, boxes
     )

@@ -32,6 +32,9 @@ NO_LOAD = "no_load"
 MOTOR = (CORNER, NO_LOAD, *OWN)
 SOURCE = "source"  # of a motor's numbers, in words
 MOST_ARMATURE = 10.0  # [kg m^2] a tenth of it is much, reflected by the gears of a humanoid's hip
+# of the effort, that losses of a file take at the speed limit: more is no loss, but the line on
+# which a motor's torque falls with its speed, which counts already
+MOST_LOST = 0.9
 # how much left and right may differ; the paper prints none of these numbers
 AXIS_RAD = 1e-4  # URDFs print a right angle as 1.5708; axes this close to x, y or z are meant to be
 ALIKE = 1e-6  # [m] and relative: as strict as the audit's idea of mirrored joints
@@ -314,15 +317,17 @@ def _limits(
     if sentence := _motor_fault(limits):
         raise tree.error(f"joint {joint!r}: {sentence}; correct [{where}]")
     own = tree.joints[joint].losses | limits
-    if not (sentence := _motor_fault(own)):
+    if not (sentence := _motor_fault(own, MOST_LOST)):
         return own
     used = len(own) - len(limits)
     changed[f"joint {joint!r}: losses of the file not used, {sentence}"] = (used, "numbers")
     return limits
 
 
-def _motor_fault(limits: dict[str, float]) -> str:
-    """Fault of a motor's numbers, in a sentence; empty if they have none."""
+def _motor_fault(limits: dict[str, float], most: float = 1.0) -> str:
+    """Fault of a motor's numbers, in a sentence; empty if they have none. At the speed limit its
+    losses take less than ``most`` of its effort [1].
+    """
     speed = limits["velocity"]
     effort = limits["effort"]
     free = limits.get(NO_LOAD, speed)
@@ -345,7 +350,7 @@ def _motor_fault(limits: dict[str, float]) -> str:
             f"armature = {armature:g} kg m^2 must be at most {MOST_ARMATURE:g} kg m^2, as joints "
             f"have"
         )
-    if lost >= effort:
+    if lost >= most * effort:
         return (
             f"friction and damping take {lost:g} N m at the speed limit, and the effort is "
             f"{effort:g} N m"

@@ -34,7 +34,11 @@ ON_JOINT = [*map(int, (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPAREN
 TIES = [*map(int, (EQUALITY.mjEQ_CONNECT, EQUALITY.mjEQ_WELD))]  # of bodies: closed chains
 # an activation of these is no larger than the control
 PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT))]
+# points of a sphere of radius 1, (n, 3), 6 deg apart
+TURN, TILT = np.radians(np.meshgrid(np.arange(0, 360, 6), np.arange(-90, 91, 6))).reshape(2, -1)
+ROUND = np.stack([np.cos(TILT) * np.cos(TURN), np.cos(TILT) * np.sin(TURN), np.sin(TILT)], axis=-1)
 LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
+MASSLESS = "; give the body an <inertial> with a mass above 0"
 UNNAMED = "MuJoCo Model"
 MOST_MESHES = 5  # of which hulls are made in half a second; MuJoCo lets nothing else run then
 MOST_TOES = 2  # joints that hang on a foot
@@ -75,9 +79,9 @@ def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     """
     # MuJoCo would write its warnings into a file of the working folder
     mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
-    texts = dict(_included(path.parent, text))
+    texts = dict(_included(path, text))
     # MuJoCo reads only files that are called so; what they include may lie in other folders
-    plain = path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64])
+    plain = path.suffix in (".xml", ".urdf") and path.read_bytes() == text.encode()
     while True:
         try:
             if plain:
@@ -104,25 +108,32 @@ def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
             notes.append(f"<{tag}> has {key!r}, which this MuJoCo does not know: left out")
 
 
-def _included(folder: Path, text: str) -> Iterator[tuple[str, str]]:
-    """Names and contents of the files that a text includes, and of those that they include."""
-    for name in re.findall(r"<include\s[^>]*file\s*=\s*[\"']([^\"']+)", text):
-        if (folder / name).is_file():
-            inner = (folder / name).read_text("utf-8", "replace")
-            yield name, inner
-            yield from _included(folder, inner)
+def _included(path: Path, text: str) -> Iterator[tuple[str, str]]:
+    """Names and contents of the files that a text includes or attaches, and of those in them."""
+    todo = [(path.parent, text)]
+    seen = {path.resolve()}
+    for folder, outer in todo:
+        for name in re.findall(r"<(?:include|model)\s[^>]*file\s*=\s*[\"']([^\"']+)", outer):
+            # beside the first file, or beside the one that includes it
+            files = (path.parent / name, folder / name)
+            file = next((x.resolve() for x in files if x.is_file()), None)
+            if file is not None and file not in seen:
+                inner = file.read_text("utf-8", "replace")
+                seen.add(file)
+                todo.append((file.parent, inner))
+                yield name, inner
 
 
 def _sentence(e: Exception) -> str:
     """MuJoCo's complaint in a line, with the element that it names."""
     sentence = "; ".join(line.strip() for line in str(e).splitlines() if line.strip())
-    return sentence + ("; give the body an <inertial>" if "mjMINVAL" in sentence else "")
+    return sentence + (MASSLESS if "mjMINVAL" in sentence else "")
 
 
 def _name(spec: mujoco.MjSpec, path: Path, text: str) -> str:
     """The robot's name: of the model, of a file that it includes, else of file or folder."""
     inner = [spec.modelname if spec.modelname != UNNAMED else ""]
-    for _, part in _included(path.parent, text):
+    for _, part in _included(path, text):
         inner += re.findall(r"<mujoco\s[^>]*model\s*=\s*\"([^\"]+)", part)
     names = (GENERIC.sub("", name) for name in (*inner, path.stem, path.resolve().parent.name))
     return next((name for name in names if name.strip(" _-")), path.stem)
@@ -302,6 +313,10 @@ def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
 # --------------------------------------------------------------------------------------------------
 def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
     """Least and greatest force (2,) of an actuator, before its gear; infinite if nothing says."""
+    group = int(model.actuator_group[a])
+    off = bool(model.opt.disableactuator >> group & 1)
+    if off or not (np.any(model.actuator_gainprm[a, :2]) or model.actuator_biastype[a]):
+        return np.zeros(2)  # switched off, or a damper
     ends = np.array([-np.inf, np.inf])
     if model.actuator_forcelimited[a]:
         ends = model.actuator_forcerange[a].copy()
@@ -534,6 +549,8 @@ class _Writer:
         hull = model.mesh_graphadr[model.geom_dataid[g]] if kind == GEOM.mjGEOM_MESH else -1
         if kind == GEOM.mjGEOM_SPHERE:
             tag, sizes = "sphere", {"radius": radius}
+        elif kind == GEOM.mjGEOM_ELLIPSOID:
+            tag, sizes = "mesh", {"vertex": (ROUND * model.geom_size[g]).ravel()}
         elif tag := LONG.get(kind):
             sizes = {"radius": radius, "length": 2 * half}
         elif hull >= 0:
@@ -630,16 +647,18 @@ class _Writer:
             add(follower, "mimic", joint=leader, multiplier=factor, offset=offset)
 
     def note_what_is_left_out(self) -> None:
-        """Springs, tendons, and actuators that act on no joint."""
+        """Springs, tendons, compensation of gravity, and actuators that act on no joint."""
         model = self.model
         counted = self._joints(k for k in self.joints if self.ref[k])
         springs = self._joints(k for k in self.joints if model.jnt_stiffness[k])
+        eased = listed(self.names[i] for i in self.bodies if model.body_gravcomp[i])
         tendons = listed(model.tendon(t).name or t for t in range(model.ntendon))
         pulled = [k for t in range(model.ntendon) for k in self._joints_of(t)]
         tendons += f" of the joints {self._joints(dict.fromkeys(pulled))}" if pulled else ""
         others = listed(self.motors.others)
         for names, sentence in (
             (counted, "the joints {} have their zero at their ref"),
+            (eased, "the gravity compensation of the bodies {} is left out"),
             (springs, "the springs of the joints {} are left out"),
             (tendons, "the tendons {} are left out"),
             (others, "the actuators {} act on no joint: their torque is not counted"),

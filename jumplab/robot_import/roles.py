@@ -214,6 +214,18 @@ class _Finder:
         pairs = [pair for pair in pairs if self.along(pair[0][0]) and pair[1][0]]
         return min(pairs, key=lambda pair: self.at[pair[0][0][2]] @ self.up, default=[])
 
+    def refuse_four(self) -> None:
+        """Raise if other limbs stand as well: arms end higher."""
+        firsts = {chain[0] for _, chain in self.legs}
+        for limb in self.limbs():
+            other = all(self.along(self.triple(chain)) for chain in limb)
+            if other and not firsts & {joint for chain in limb for joint in chain}:
+                names = listed(x[-1].name for x in (*limb, *(chain for _, chain in self.legs)))
+                raise self.tree.error(
+                    f"four legs end on the ground, with the joints {names}: jumps are planned for "
+                    f"robots with two"
+                )
+
     def foot(self, three: tuple[Joint, ...], chain: Chain) -> str:
         """The link that stands: behind the ankle, before any toe joint (a further pitch joint)."""
         _, knee, ankle = (self.at[joint] for joint in three)
@@ -326,6 +338,7 @@ def find_roles(tree: Tree) -> Roles:
     """Legs, knees, feet, arms and forward direction; else a :class:`RobotError` says why."""
     finders = (_Finder(tree, guess) for guess in GUESSES)
     finder = next((finder for finder in finders if finder.legs), None) or _explain(tree)
+    finder.refuse_four()
     for three, _ in finder.legs:
         refuse_wheel(tree, three[2])
     notes = []
@@ -434,18 +447,32 @@ def _explain(tree: Tree) -> NoReturn:
                     f"both legs must have the same joints"
                 )
     finder = _Finder(tree, GUESSES[0])
-    hanging = {chain[-1].name for chain in finder.tips if finder.along(finder.triple(chain))}
+    hanging = {chain[-1]: 0 for chain in finder.tips if finder.along(finder.triple(chain))}
     if len(hanging) == 1:
         raise tree.error(
-            f"one leg only: the chain that ends with joint {hanging.pop()!r} has no "
+            f"one leg only: the chain that ends with joint {next(iter(hanging)).name!r} has no "
             f"mirror image among {len(tree.elements)} links; a jumper needs two legs"
+        )
+    if len(hanging) == 2:
+        one, other = hanging
+        legs = f"the legs that end with the joints {one.name!r} and {other.name!r}"
+        gap = finder.at[one] - finder.at[other]
+        if abs(gap @ finder.lateral) < SAME_M:
+            raise tree.error(f"{legs} are none to the left and none to the right of the trunk")
+        apart = 1e3 * norm(gap * (1 - np.abs(finder.lateral)))
+        raise tree.error(
+            f"{legs} end {apart:.0f} mm from where mirror images do, {1e3 * SAME_M:.0f} mm or more "
+            f"is another robot's leg; correct the origins of one"
         )
     limbs = [chain for pair in finder.limbs() for chain in pair[::-1]]
     best = max(map(finder.pitch, limbs or finder.tips), key=len, default=[])
     shown = ", ".join(repr(j.name) for j in best[:4]) or "none"
+    way = tree.chain(best[-1].child) if best else []
+    others = [f"{j.name!r} is {j.kind}" for j in way if j.kind in ("prismatic", "floating")]
     raise tree.error(
         f"no pair of mirrored legs with three revolute pitch joints (hip, knee, "
         f"ankle) was found; the most on one chain about +-y are {len(best)} ({shown})"
+        + "".join(f", and {x} there" for x in others[:1])
     )
 
 
@@ -482,7 +509,7 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
         leg_m = float(norm((turn @ (hip - ankle))[[0, 2]]))
         sole = find_sole(tree, roles.feet[0], turn, leg_m)
     except RobotError as e:
-        for note in notes(tree):
+        for note in (*notes(tree), *dict.fromkeys(tree.notes)):
             e.add_note(note)
         raise
     assumed = "".join(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib import import_module, metadata
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
 import coal
@@ -179,15 +180,31 @@ def parse(text: str, where: str) -> ET.Element:
     # a "${...}" in a simulator's plug-in or a call left over beside whole links does no harm
     parts = [e for kind in ("link", "joint") for part in root.findall(kind) for e in part.iter()]
     left = any("xacro" in e.tag for e in parts or root.iter())
-    if left or any("${" in v for e in parts for v in e.attrib.values()):
+    if left or any(_open(*x) for e in parts for x in e.attrib.items()):
         raise RobotError(xacro)
     if root.tag != "robot":
         what = ROOTS.get(root.tag, "a URDF begins with <robot>")
         raise RobotError(f"{where}: the root element is <{root.tag}>, {what}")
+    _drop_lone_links(root)
     if late:
         words = "the XML declaration stands behind a comment or a space, and is ignored"
         ET.SubElement(root, "note", text=words)
     return root
+
+
+def _open(key: str, value: str) -> bool:
+    """Whether an attribute waits for xacro; where a mesh lies may be found all the same."""
+    return "${" in value or ("$(" in value and key != "filename")
+
+
+def _drop_lone_links(root: ET.Element) -> None:
+    """Take out links without mass that no joint joins to anything, such as a left-over world."""
+    joined = {end.get("link") for joint in root.findall("joint") for end in joint}
+    for link in root.findall("link") if joined else ():
+        if link.get("name") not in joined and not len(link):
+            root.remove(link)
+            words = f"the link {link.get('name')!r} is joined to nothing, and left out"
+            ET.SubElement(root, "note", text=words)
 
 
 # numbers of elements
@@ -462,11 +479,12 @@ class Tree:
 
     def _mesh(self, shape: ET.Element) -> coal.BVHModelBase | None:
         """A mesh from beside the URDF or above it; None if it is not there, or cannot be read."""
-        inside = shape.get("filename", "").split("://", 1)[-1].lstrip("/")
+        inside = unquote(shape.get("filename", "")).replace("\\", "/")
+        inside = re.sub(r"^(\w+://|\$\(find\s+([^)]*)\))", r"\2", inside).lstrip("/")
         packages = filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))
         folders = [*(self.path.resolve().parents if self.path else ()), *map(Path, packages)]
         names = (inside, inside.split("/", 1)[-1])
-        file = next((f / name for f in folders for name in names if (f / name).is_file()), None)
+        file = next((x for f in folders for name in names if (x := _file(f / name))), None)
         if file is None:
             return None
         scale = numbers(shape.get("scale", "1 1 1"), 3)
@@ -480,6 +498,14 @@ class Tree:
         # a pointer to a mesh that was not downloaded, or a format of its own
         except (RuntimeError, ValueError):
             return None
+
+
+def _file(path: Path) -> Path | None:
+    """A file, whether its name has capital letters or not; None without one."""
+    if path.is_file():
+        return path
+    beside = path.parent.iterdir() if path.parent.is_dir() else ()
+    return next((x for x in beside if x.name.lower() == path.name.lower() and x.is_file()), None)
 
 
 def links_of(model: pin.Model) -> dict[str, int]:

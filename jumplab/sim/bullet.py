@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import locale
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -79,11 +82,23 @@ def load_urdf(urdf: str, name: str, client: int, flags: int = 0) -> int:
     flags |= bullet.URDF_USE_INERTIA_FROM_FILE
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         path = Path(folder, "robot.urdf")  # Bullet reads files only
-        path.write_text(urdf)
+        path.write_text(urdf, encoding="utf-8")
         try:
-            return bullet.loadURDF(str(path), flags=flags, physicsClientId=client)
+            with _decimal_points():
+                return bullet.loadURDF(str(path), flags=flags, physicsClientId=client)
         except bullet.error as e:
             raise RobotError(f"robot {name}: PyBullet cannot read the URDF: {e}") from e
+
+
+@contextmanager
+def _decimal_points() -> Iterator[None]:
+    """Numbers with points, as Bullet must read them: those of a host program may have commas."""
+    before = locale.setlocale(locale.LC_NUMERIC)
+    locale.setlocale(locale.LC_NUMERIC, "C")
+    try:
+        yield
+    finally:
+        locale.setlocale(locale.LC_NUMERIC, before)
 
 
 def base_to_bullet(

@@ -22,10 +22,10 @@ MILDER = 0.6  # of a number that was refused
 BEYOND = 1.4  # times the least distance that a platform takes
 ON_THE_SPOT = 3  # after so many tries a jump on the level that goes nowhere is the next
 # so many easier targets are tried, and none is begun after so long [s of CPU time], or once the
-# patience for the target itself is spent and so many times of it besides: the usual 20 s become 24
+# patience for the target itself is spent and so many times of it besides: the usual 20 s become 22
 TRIES = 8
 LONGEST_S = 30.0
-AFTER = 0.2
+AFTER = 0.1
 THREE_STEPS = ("SRMP", "joint_map")  # where a refusal is none of the method "direct"
 NEAR_RECORD = 0.85  # share of a record, from where on a refusal names it
 LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
@@ -42,7 +42,7 @@ def plan_or_advise(
     ``starts``); a refusal ends with an easier target that has a plan.
 
     Planning ends after ``patience_s`` of processor time [s]. Looking for another target takes what
-    is left of it, and at most a fifth more, so studies of many targets leave it out.
+    is left of it, and at most a tenth more, so studies of many targets leave it out.
     """
     began = time.thread_time()
     with patience(patience_s):

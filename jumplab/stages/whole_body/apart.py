@@ -49,16 +49,21 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
         near = np.flatnonzero((gaps.max(axis=0) < least_m) & ((phase > 0) | (node >= 1)))
         met = [row for row in near if _distance(body, number, configurations[row]) < least_m]
         for rows in runs(np.array(met, int), 2 * NODES * SAMPLES):
-            face = _face(gaps, rows, least_m)  # one, or neighbouring phases ask for two
-            ends = (one[0], other[0]) if face < 6 else (other[0], one[0])
-            pair = Pair(*ends, face % 6)
+            # one, or neighbouring phases ask for two
+            faces = _face(gaps, rows, least_m), _face_before(gaps, rows[0], least_m)
+            pair, before = (_pair(one[0], other[0], face) for face in faces)
             for part in np.unique(phase[rows]):
                 nodes = node[rows[phase[rows] == part]]
                 first = max(1, int(nodes.min()) - NODES)
                 end = min(last[part], int(np.ceil(nodes.max())) + NODES)
                 if first <= end:
-                    out.append(Apart(int(part), first, end, pair))
+                    out.append(Apart(int(part), first, end, pair, before=before))
     return out
+
+
+def _pair(one: Box, other: Box, face: int) -> Pair:
+    """Two boxes, the one with the ``face``, of 12, first."""
+    return Pair(one, other, face) if face < 6 else Pair(other, one, face - 6)
 
 
 def _face(gaps: np.ndarray, rows: np.ndarray, least_m: float) -> int:
@@ -73,6 +78,12 @@ def _face(gaps: np.ndarray, rows: np.ndarray, least_m: float) -> int:
     may = clear[:, around].all(axis=1)
     least = gaps[:, rows].min(axis=1)
     return int(np.argmax(np.where(may, least, -np.inf) if may.any() else least))
+
+
+def _face_before(gaps: np.ndarray, row: int, least_m: float) -> int:
+    """The face that keeps two boxes farthest apart where they are clear last before a ``row``."""
+    clear = np.flatnonzero((gaps[:, :row] >= least_m).any(axis=0))
+    return int(np.argmax(gaps[:, clear[-1] if len(clear) else 0]))
 
 
 def used_apart(

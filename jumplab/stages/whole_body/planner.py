@@ -26,6 +26,7 @@ from jumplab.stages.whole_body.coordinates import Coordinates, even, in_plane, w
 from jumplab.stages.whole_body.limiting import held_back
 from jumplab.stages.whole_body.motions import Motion, configurations
 from jumplab.stages.whole_body.plan import WholeBodyPlan
+from jumplab.stages.whole_body.problem import NAME
 from jumplab.stages.whole_body.program import Program, Solved
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.starts import (
@@ -208,11 +209,10 @@ class WholeBodyPlanner:
             if left_s() <= 0:
                 raise _farthest(failures)
             raise (explain and self._explained(programs[-1], asked)) or failures[-1]
-        name = programs[-1].nlp.problem.name
         raise SolverError(
-            f"{name}: motions that keep every limit at the nodes break them between the nodes, at "
+            f"{NAME}: motions that keep every limit at the nodes break them between the nodes, at "
             f"best by a factor of {best.used:.3g}; ask for less, or for a finer mesh",
-            stage=name,
+            stage=NAME,
         )
 
     @in_turn

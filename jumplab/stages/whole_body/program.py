@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -22,7 +22,7 @@ from jumplab.ocp.solution import PhaseSolution, resampled
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body.apart import merged, runs, too_close
+from jumplab.stages.whole_body.apart import MORE_M, merged, runs, too_close
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.coordinates import KINDS, Coordinates
@@ -34,10 +34,13 @@ from jumplab.stages.whole_body.shapes import Apart
 from jumplab.stages.whole_body.starts import (
     AFTER_ROUGH,
     APART,
+    STILL,
     Asked,
     Beginning,
     Start,
+    from_neighbour,
     from_solved,
+    unpassed,
 )
 from jumplab.task import RANGES, JumpTask
 
@@ -169,7 +172,8 @@ class Program(Shown):
 
     def spent(self, asked: Asked) -> bool:
         """Whether no other start and no finer mesh is tried: there was one, and time is over."""
-        return bool(asked.attempts) and self.left_s(asked) <= 0
+        # a program that is not built yet has no size, and building it takes seconds
+        return bool(asked.attempts) and (left_s() <= 0 or self.left_s(asked) <= 0)
 
     def solve(
         self, asked: Asked, start: Start, begin: Beginning | None = None, *, explain: bool = False
@@ -224,21 +228,33 @@ class Program(Shown):
         """
         solved = self.solve(asked, start)
         held = start.held
+        still = start.rough or start.begin is from_neighbour or self.contacts.ends == "rest"
         for number in range(ROUNDS):
             begin = from_solved(self, solved)
             rows = merged(begin.apart, self._met(solved))
             if rows == begin.apart and (number or not start.rough):
                 break
+            more = any(x.more_m > MORE_M for x in rows if x not in begin.apart)
             begin = replace(begin, apart=rows)
             again = AFTER_ROUGH[min(number, 1)] if start.rough else APART[not held]
-            try:
-                solved = self.solve(asked, again, begin)
-            except SolverError:
-                if not held or self.left_s(asked) <= 0:
-                    raise
-                held = False  # where it wandered once it wanders again
-                solved = self.solve(asked, APART[-1], begin)
+            ways = [(again, begin), (APART[-1], begin)][: 1 + held]
+            if not still:  # where more distance does not help, they may not pass each other
+                ways.insert(0 if more else len(ways), (STILL, unpassed(self, asked, rows)))
+            solved, way = self._first(asked, ways)
+            held = held and way.held
+            still = still or way is STILL
         return solved
+
+    def _first(self, asked: Asked, ways: Sequence[tuple[Start, Beginning]]) -> tuple[Solved, Start]:
+        """The first of several ways that leads anywhere, while there is time, and which it was."""
+        *others, (last, begin_last) = ways
+        for way, begin in others:
+            try:
+                return self.solve(asked, way, begin), way
+            except SolverError:
+                if self.left_s(asked) <= 0:
+                    raise
+        return self.solve(asked, last, begin_last), last
 
     def _met(self, solved: Solved) -> list[Apart]:
         """Rows for links that meet; in an even motion without those of mirror images."""

@@ -60,7 +60,7 @@ class Pair:
 @dataclass(frozen=True)
 class Apart:
     """Two links that a face keeps apart, at nodes ``first`` to ``last`` of one phase, by ``more_m``
-    than usual.
+    than usual; ``before`` is the face that did so before they met.
     """
 
     phase: int
@@ -68,3 +68,4 @@ class Apart:
     last: int
     pair: Pair
     more_m: float = 0.0
+    before: Pair | None = None

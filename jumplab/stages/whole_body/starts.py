@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -201,6 +201,14 @@ def from_solved(program: Program, solved: Solved) -> Beginning:
     return Beginning(solution.guess(intervals), solution.multipliers, tuple(apart))
 
 
+def unpassed(program: Program, asked: Asked, rows: Sequence[Apart]) -> Beginning:
+    """The stance, carried along the schedule, with links that met kept where they were before they
+    did: an arm that cannot swing past a thigh stays behind it.
+    """
+    kept = tuple(replace(x, pair=x.before or x.pair, more_m=0.0) for x in rows)
+    return replace(from_stance(program, asked), apart=kept)
+
+
 NEIGHBOUR = "neighbour"
 STANCE = "stance"
 MENDED = "given motion, feet in place"
@@ -267,6 +275,7 @@ APART = (
     Start("links apart", from_neighbour, True, 80, MET),
     Start("links apart", from_neighbour, False, 120, MET),
 )
+STILL = replace(COLD[-1], name="links apart as before")
 # from a rough solution, further inside the limits with a higher barrier; then from what came of it
 STEPPED = MET | {"mu_strategy": "monotone"}
 AFTER_ROUGH = tuple(
