@@ -291,6 +291,14 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_
     assert plans[2].used == 1.2
 
 
+def test_a_start_after_a_mesh_that_was_too_coarse_begins_on_the_finer_one(doubted):
+    last, known, said = doubted
+    said(*[1.6] * len(["neighbour", "settled", *["finer mesh"] * 3]), 0.9)
+    plan = last(AHEAD, near=known)
+    assert [x.start for x in plan.attempts].count("neighbour") == 2 and plan.used == 0.9
+    assert [len(x.j) for x in plan.phases.values()] == [np.ceil(FINER * n) for n in Mesh().intervals().values()]
+
+
 @pytest.mark.parametrize(
     ("late", "shares", "third"),
     [

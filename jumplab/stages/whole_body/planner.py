@@ -195,8 +195,10 @@ class WholeBodyPlanner:
             for start in usual:
                 if program.spent(asked):
                     break
+                # a mesh that was too coarse for one start is so for the next
+                on = program.finer if plans else program
                 try:
-                    plans.append(self.refined(program, asked, start))
+                    plans.append(self.refined(on, asked, start))
                 except (SolverError, InfeasibleError) as e:  # the jump straight ahead may have none
                     failures.append(e)
                     continue
