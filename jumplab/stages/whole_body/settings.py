@@ -169,7 +169,7 @@ class Weights:
 
     def of_clip(self) -> Weights:
         """The same for a motion that follows another one: what it costs counts less."""
-        return replace(self, acceleration=2e-4, jerk=3e-7, torque=5e-5, posture=0.0)
+        return replace(self, acceleration=2e-4, jerk=3e-7, torque=5e-5)
 
     def of_size(self, size: Size) -> Weights:
         """Those of a robot of another ``size``: each term has the same share of the cost."""
