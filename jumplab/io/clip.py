@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from joblib.numpy_pickle import NumpyArrayWrapper, NumpyUnpickler
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +30,13 @@ LEAST_FRAMES = 10
 FPS = 5.0, 10_000.0  # least and most
 TURN_RAD = 7.0  # no joint turns further
 BEYOND_RAD = 0.5  # of its range, by which a joint of the right robot is not most of the time
+# joints are in the other order if with it the lower sole's usual tilt is less than this share of
+# it, which is more than that: public clips have shares of 0.2 to 0.6, and 0.07 to 0.5 rad of tilt
+FLATTER = 0.7
+TILTED_RAD = 0.3
+LEVEL_RAD = 0.45  # what it has to be less than in that order
+LYING_RAD = 0.8  # from which on a note says so: the order may be a third one
+LOOKED_AT = 100  # frames at most
 STILL_RAD = 0.02  # by which a joint that the robot holds may move
 # what a pickle may name: arrays and nothing that could run
 ARRAYS = {
@@ -125,6 +133,8 @@ def _content(path: Path) -> Mapping[str, Any]:
     """Arrays and numbers of a file by name; of a CSV file by column."""
     try:
         raw = reading.content(path, "clip")
+        if not raw.strip():
+            raise InputError(f"{path}: is empty; give a pickle, npz or csv file")
         if raw[:2] == b"PK":
             found = read_tensors(raw)
             return reading.arrays(raw) if found is None else found
@@ -315,8 +325,11 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
     robot, q = _fitted(where, raw, robot, order)
     if raw.names is None:
         notes.append(f"joints taken for {order}")
+        tilt = _check_order(where, raw, robot, q, order)
+        if tilt > LYING_RAD:
+            notes.append(f"with them the lower sole is {tilt:.1f} rad off level half of the time")
     q = np.hstack([q[:, :3], steady(q[:, 3:7]), q[:, 7:]])
-    _check_joints(where, robot, q, raw.names is None, order)
+    _check_joints(where, robot, q)
     return Clip(name, robot, q, rate, raw.origin, tuple(notes))
 
 
@@ -434,28 +447,45 @@ def _siblings(robot: Robot) -> Iterator[Robot]:
             yield Robot.load(name)
 
 
-def _check_joints(where: str, robot: Robot, q: np.ndarray, unnamed: bool, order: str) -> None:
+def _check_order(where: str, raw: _Raw, robot: Robot, q: np.ndarray, order: str) -> float:
+    """Tilt of the lower sole (see :func:`_tilt`); refuses joints in an ``order`` with which soles
+    are tilted, if they are level in the other one.
+    """
+    tilt = _tilt(robot, q)
+    other = ORDERS[order == ORDERS[0]]
+    try:
+        again = _tilt(*_fitted(where, raw, robot, other))
+    except InputError:
+        return tilt
+    if again < min(LEVEL_RAD, FLATTER * tilt) and tilt > TILTED_RAD:
+        raise InputError(
+            f"{where}: in {order} order its lower sole is {tilt:.1f} rad off level half of the "
+            f"time, in {other} order {again:.1f} rad; pass order = {other!r}"
+        )
+    return tilt
+
+
+def _tilt(robot: Robot, q: np.ndarray) -> float:
+    """Median angle of the lower sole to the ground [rad], in configurations (n, nq)."""
+    data = robot.model.createData()
+    frames = [robot.model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames]
+    upright = []
+    for row in q[:: max(1, len(q) // LOOKED_AT)]:
+        pin.framesForwardKinematics(robot.model, data, row)
+        lower = min((data.oMf[k] for k in frames), key=lambda x: x.act(robot.foot.center)[2])
+        upright.append(lower.rotation[2, 2])
+    return float(np.arccos(min(1.0, np.median(upright))))
+
+
+def _check_joints(where: str, robot: Robot, q: np.ndarray) -> None:
     """Refuse joints that are out of their ranges most of the time: another order, or robot."""
     limits = robot.limits
-
-    def beyond(joints: np.ndarray) -> np.ndarray:
-        return np.median(np.maximum(limits.lower - joints, joints - limits.upper), axis=0)
-
-    off = beyond(q[:, 7:])
+    beyond = np.maximum(limits.lower - q[:, 7:], q[:, 7:] - limits.upper)
+    off = np.median(beyond, axis=0)
     worst = int(off.argmax())
-    if off[worst] <= BEYOND_RAD:
-        return
-    words = (
-        f"{where}: joint {robot.joint_names[worst]!r} is {off[worst]:.1f} rad beyond its range "
-        f"most of the time"
-    )
-    other = ORDERS[order == ORDERS[0]]
-    if unnamed:
-        names = [ordered(robot.urdf, x)[0] for x in (order, other)]
-        joints = q[:, [7 + names[1].index(name) for name in names[0]]]
-        if beyond(joints).max() < BEYOND_RAD:
-            raise InputError(f"{words}, but no joint is in {other} order; pass order = {other!r}")
-    raise InputError(
-        f"{words}: its joints are in another order, or the clip is of another robot; correct "
-        "the order, or pass that robot"
-    )
+    if off[worst] > BEYOND_RAD:
+        raise InputError(
+            f"{where}: joint {robot.joint_names[worst]!r} is {off[worst]:.1f} rad beyond its range "
+            f"most of the time: its joints are in another order, or the clip is of another robot; "
+            f"correct the order, or pass that robot"
+        )
