@@ -320,8 +320,8 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
             f"{where}: states {raw.fps:g} frames per second, but fps = {fps:g} is given; "
             f"leave out fps"
         )
-    _check_numbers(where, raw)
-    _check_axes(where, raw)
+    for fault in _faults(raw):
+        raise InputError(f"{where}: {fault}")
     robot, q = _fitted(where, raw, robot, order)
     if raw.names is None:
         notes.append(f"joints taken for {order}")
@@ -342,45 +342,34 @@ def _numbers(raw: _Raw) -> dict[str, np.ndarray]:
     return out
 
 
-def _check_numbers(where: str, raw: _Raw) -> None:
+def _faults(raw: _Raw) -> Iterator[str]:
+    """Sentences on what makes arrays no motion in metres and radians, z up."""
     n = len(raw.base)
     shapes = raw.base.shape == (n, 3) and raw.turn.shape == (n, 4)
     if not shapes or raw.joints.ndim != 2 or len(raw.joints) != n:
         sizes = f"{raw.base.shape}, {raw.turn.shape}, {raw.joints.shape}"
-        raise InputError(
-            f"{where}: base, quaternions and joints have shapes {sizes}; they must be (n, 3), "
-            f"(n, 4), (n, joints)"
+        yield (
+            f"base, quaternions and joints have shapes {sizes}; they must be (n, 3), (n, 4), "
+            f"(n, joints)"
         )
     if n < LEAST_FRAMES:
-        raise InputError(f"{where}: has {n} frames; a motion has {LEAST_FRAMES} or more")
+        yield f"has {n} frames; a motion has {LEAST_FRAMES} or more"
     whole = np.hstack([raw.base, raw.turn, raw.joints]).astype(float)
-    bad = np.argwhere(~np.isfinite(whole))
-    if len(bad):
-        frame, column = bad[0]
-        raise InputError(
-            f"{where}: frame {frame}, column {column} is not a finite number; repair it"
-        )
+    for frame, column in np.argwhere(~np.isfinite(whole)):
+        yield f"frame {frame}, column {column} is not a finite number; repair it"
     length = np.linalg.norm(raw.turn, axis=1)
-    if np.abs(length - 1).max() > 0.01:
-        frame = int(np.abs(length - 1).argmax())
-        raise InputError(
-            f"{where}: the quaternion of frame {frame} has length {length[frame]:.3g}, must be 1; "
-            "normalise it"
+    frame = int(np.abs(length - 1).argmax())
+    if abs(length[frame] - 1) > 0.01:
+        yield (
+            f"the quaternion of frame {frame} has length {length[frame]:.3g}, must be 1; "
+            f"normalise it"
         )
     most = np.abs(raw.joints).max()
     if most > TURN_RAD:
-        raise InputError(
-            f"{where}: joint angles up to {most:.0f}; they look like degrees: pass radians"
-        )
-    if np.median(np.abs(raw.base).max(axis=1)) > 50:
-        raise InputError(
-            f"{where}: the base is {np.abs(raw.base).max():.0f} m away; it looks like "
-            f"centimetres: pass metres"
-        )
-
-
-def _check_axes(where: str, raw: _Raw) -> None:
-    """Refuse quaternions w x y z, and worlds whose y points up."""
+        yield f"joint angles up to {most:.0f}; they look like degrees: pass radians"
+    away = np.abs(raw.base)
+    if np.median(away.max(axis=1)) > 50:
+        yield f"the base is {away.max():.0f} m away; it looks like centimetres: pass metres"
 
     def upright(turn: np.ndarray, axis: int = 2) -> float:
         return float(np.median(Rotation.from_quat(turn).as_matrix()[:, axis, 2]))
@@ -388,13 +377,11 @@ def _check_axes(where: str, raw: _Raw) -> None:
     if upright(raw.turn) > 0.5:
         return
     if upright(raw.turn, 1) > 0.9 and np.median(raw.base[:, 1]) > np.median(raw.base[:, 2]):
-        raise InputError(
-            f"{where}: the robot's up is the world's y; turn the clip so that z points up"
-        )
+        yield "the robot's up is the world's y; turn the clip so that z points up"
     if upright(_first_wxyz(raw.turn)) > 0.9:
-        raise InputError(
-            f"{where}: its quaternions, read as x y z w, lay the robot down or stand it on its "
-            f"head; read as w x y z they keep it upright: reorder them to x y z w"
+        yield (
+            "its quaternions, read as x y z w, lay the robot down or stand it on its head; read as "
+            "w x y z they keep it upright: reorder them to x y z w"
         )
 
 

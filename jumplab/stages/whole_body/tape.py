@@ -250,7 +250,8 @@ def _balanced(
     Where all feet that carry are on their toes, in one ``line``, no ground force has a moment about
     it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides the
     planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. The
-    shift of the base in a phase vanishes within it if the phase ``stays`` on the ground.
+    shift of the base in a phase vanishes within it if the phase ``stays`` on the ground; what leads
+    it back is in proportion to the squared load, so that it moves the centre of pressure least.
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
