@@ -191,6 +191,23 @@ def test_a_clip_that_cannot_be_meant_is_refused_in_a_sentence(fault, tmp_path):
         read_clips(library(tmp_path, **changes), standing().robot)
 
 
+def test_joints_in_the_other_order_are_refused_and_in_a_third_one_noted(tmp_path):
+    robot = standing().robot
+    crouched = 3 * DOF
+    crouched[:, -2:] = 1.2  # arms
+    columns = [ordered(robot.urdf)[0].index(name) for name in ordered(robot.urdf, "breadth-first")[0]]
+    path = library(tmp_path, dof=crouched[:, columns])
+    with pytest.raises(InputError, match=r"in breadth-first order 0\.1 rad; pass order = 'breadth-first'"):
+        read_clips(path, robot)
+    (clip,) = read_clips(path, robot, order="breadth-first")
+    there = [7 + robot.joint_names.index(name) for name in ordered(robot.urdf)[0]]
+    assert np.allclose(clip.q[:, there], crouched) and "level" not in clip.line()
+    tipped = DOF.copy()
+    tipped[:, [ordered(robot.urdf)[0].index(f"{side}_ankle_pitch") for side in ("left", "right")]] -= 1.0
+    (clip,) = read_clips(library(tmp_path, dof=tipped), robot)
+    assert "the lower sole is 1.0 rad off level half of the time" in clip.line()
+
+
 def test_joints_of_another_robot_are_named(tmp_path):
     path = tmp_path / "clip.npz"
     names = [f"strange_{k}" for k in range(Q.shape[1] - 7)]
@@ -204,6 +221,9 @@ def test_what_is_no_clip_is_refused(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=f"{name}: not a readable clip"):
             read_clips(tmp_path / name, standing().robot)
+    (tmp_path / "e.csv").write_bytes(b"")
+    with pytest.raises(InputError, match=r"e.csv: is empty; give a pickle, npz or csv file"):
+        read_clips(tmp_path / "e.csv", standing().robot)
     np.savez(tmp_path / "d.npz", other=np.zeros(3))
     with pytest.raises(InputError, match=r"holds no clip, but .'other'.; a clip has one of: root_trans_offset"):
         read_clips(tmp_path / "d.npz", standing().robot)
@@ -248,6 +268,8 @@ def test_a_clip_at_the_wrong_rate_is_told_the_one_with_which_it_falls_freely(tmp
     plan = jump(0.6, 0.3, method="direct")
     export.write("unitree-csv", Motion.of(plan.tape), plan.robot, path, fps=50)
     code, out, _ = run(capsys, "judge", path, "--fps", "60")
-    assert code == 3 and "at 50 frames per second its flights would fall freely: is 60 its rate?" in out
+    assert code == 3 and "at 50 frames per second its flights would fall nearly freely: is 60 its rate?" in out
+    code, out, _ = run(capsys, "judge", path, "--fps", "120")
+    assert code == 3 and "at 50 frames per second its flights would fall nearly freely: is 120 its rate?" in out
     code, out, _ = run(capsys, "judge", path, "--fps", "50")
     assert code == 0 and "its rate?" not in out

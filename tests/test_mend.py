@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import pytest
 from test_judge import CLIPS, NO_ROBOTS, standing
@@ -16,6 +17,11 @@ from jumplab.errors import InfeasibleError, InputError
 from jumplab.io import export
 from jumplab.io.motion import Motion
 from jumplab.ocp.nlp import RESIDUAL_LIMIT
+from jumplab.robot import Robot
+from jumplab.stages.whole_body import Limits, Weights
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.mode import Mode
+from jumplab.stages.whole_body.terms import smoothness
 from jumplab.studies.mend import AROUND_S, TOES_S, Draft, planned_phases
 
 
@@ -118,6 +124,18 @@ def test_what_no_clip_shows_is_refused():
 
 
 @NO_ROBOTS
+def test_waist_and_arms_stay_near_what_is_followed():
+    body = Body(Robot.load("g1"))
+    mode = Mode(body, Limits().of_clip(), Weights().of_clip(), "LR")
+    clip = np.linspace(-0.5, 0.5, len(body.stance))
+    p = SimpleNamespace(tree=SimpleNamespace(q=ca.SX(clip)), ref=SimpleNamespace(chart=ca.SX(clip)))
+    for follows, near in ((True, clip), (False, body.stance)):
+        (term,) = (x for x in smoothness(mode, follows) if x.name == "waist and arms")
+        off = np.array(ca.evalf(term.expression(p))).ravel()
+        assert off == pytest.approx((clip - near)[body.upper]) and term.weight == 15.0 and len(off)
+
+
+@NO_ROBOTS
 def test_the_command_plans_in_the_manner_of_a_clip(tmp_path, capsys):
     clip = str(CLIPS / "side_jump_level2.pkl")
     assert main(["plan", "--robot", "g1", "--like", clip, "--out", str(tmp_path)]) == 2
@@ -133,6 +151,15 @@ def test_a_jump_to_a_target_in_the_manner_of_a_clip():
     )
     assert plan.task.side_m == pytest.approx(0.1, abs=1e-4) and plan.task.yaw_rad == pytest.approx(0.3, abs=1e-4)
     assert jl.audit(plan).passed
+
+
+@NO_ROBOTS
+@pytest.mark.slow
+def test_feet_that_carry_little_after_a_landing_need_no_finer_mesh():
+    # it hops up again 0.3 s after touchdown: what the landing moved the base by must not come back there
+    plan = jl.mend(CLIPS / "jump_degree_level4.pkl", "g1").plan
+    assert "finer mesh" not in [x.start for x in plan.whole_body.attempts]
+    assert plan.whole_body.used < 1 and jl.audit(plan).passed
 
 
 @NO_ROBOTS

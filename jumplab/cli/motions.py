@@ -6,6 +6,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import jumplab as jl
 from jumplab import io
 from jumplab.cli.common import judge as audited
@@ -15,7 +17,8 @@ from jumplab.errors import InfeasibleError
 REPORT = "judged.json"
 CHANGES = "mended.json"
 RATES = (24, 25, 30, 50, 60, 100, 120, 200, 240)  # usual frames per second
-NEAR = 0.03  # relative, of two rates that are the same
+OTHER = 1.1, 4.5  # ratio of a rate and the one that it was taken for
+NEAR = 0.25  # relative, of a rate to what flights ask for: clips fly too long for their rise
 
 
 def judge(args: Namespace) -> None:
@@ -42,23 +45,22 @@ def judge(args: Namespace) -> None:
     print("contacts: " + ", ".join(f"{feet} {a:.2f} to {b:.2f} s" for feet, a, b in report.phases))
     print(report.table())
     if rate := _better_rate(report):
-        words = f"at {rate} frames per second its flights would fall freely: is {report.clip.fps:g}"
-        print(f"{words} its rate?")
+        words = f"at {rate} frames per second its flights would fall nearly freely: is "
+        print(f"{words}{report.clip.fps:g} its rate?")
     if not report.passed:
         raise InfeasibleError(f"clip {report.line()}")
 
 
 def _better_rate(report: Any) -> int | None:
-    """The usual frame rate at which all flights of a clip fall freely, if not at its own."""
+    """The usual frame rate at which all flights of a clip nearest fall freely, if not its own."""
     falls = [-flight["acceleration_m_s2"][2] for flight in report.manifest["flights"]]
     if not falls or min(falls) <= 0:
         return None
-    wanted = [report.clip.fps * (report.clip.robot.gravity / fall) ** 0.5 for fall in falls]
-    for rate in RATES:
-        there = all(abs(x / rate - 1) < NEAR for x in wanted)
-        if there and abs(rate / report.clip.fps - 1) > 2 * NEAR:
-            return rate
-    return None
+    wanted = report.clip.fps * np.sqrt(report.clip.robot.gravity / np.array(falls))
+    rate = min(RATES, key=lambda x: abs(np.log(wanted / x)).max())
+    ratio = max(rate / report.clip.fps, report.clip.fps / rate)
+    there = np.abs(wanted / rate - 1).max() < NEAR
+    return rate if there and OTHER[0] < ratio < OTHER[1] else None
 
 
 def _write(folder: str, reports: list[Any], found: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from joblib.numpy_pickle import NumpyArrayWrapper, NumpyUnpickler
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +30,13 @@ LEAST_FRAMES = 10
 FPS = 5.0, 10_000.0  # least and most
 TURN_RAD = 7.0  # no joint turns further
 BEYOND_RAD = 0.5  # of its range, by which a joint of the right robot is not most of the time
+# joints are in the other order if with it the lower sole's usual tilt is less than this share of
+# it, which is more than that: public clips have shares of 0.2 to 0.6, and 0.07 to 0.5 rad of tilt
+FLATTER = 0.7
+TILTED_RAD = 0.3
+LEVEL_RAD = 0.45  # what it has to be less than in that order
+LYING_RAD = 0.8  # from which on a note says so: the order may be a third one
+LOOKED_AT = 100  # frames at most
 STILL_RAD = 0.02  # by which a joint that the robot holds may move
 # what a pickle may name: arrays and nothing that could run
 ARRAYS = {
@@ -125,6 +133,8 @@ def _content(path: Path) -> Mapping[str, Any]:
     """Arrays and numbers of a file by name; of a CSV file by column."""
     try:
         raw = reading.content(path, "clip")
+        if not raw.strip():
+            raise InputError(f"{path}: is empty; give a pickle, npz or csv file")
         if raw[:2] == b"PK":
             found = read_tensors(raw)
             return reading.arrays(raw) if found is None else found
@@ -310,13 +320,16 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
             f"{where}: states {raw.fps:g} frames per second, but fps = {fps:g} is given; "
             f"leave out fps"
         )
-    _check_numbers(where, raw)
-    _check_axes(where, raw)
+    for fault in _faults(raw):
+        raise InputError(f"{where}: {fault}")
     robot, q = _fitted(where, raw, robot, order)
     if raw.names is None:
         notes.append(f"joints taken for {order}")
+        tilt = _check_order(where, raw, robot, q, order)
+        if tilt > LYING_RAD:
+            notes.append(f"with them the lower sole is {tilt:.1f} rad off level half of the time")
     q = np.hstack([q[:, :3], steady(q[:, 3:7]), q[:, 7:]])
-    _check_joints(where, robot, q, raw.names is None, order)
+    _check_joints(where, robot, q)
     return Clip(name, robot, q, rate, raw.origin, tuple(notes))
 
 
@@ -329,45 +342,34 @@ def _numbers(raw: _Raw) -> dict[str, np.ndarray]:
     return out
 
 
-def _check_numbers(where: str, raw: _Raw) -> None:
+def _faults(raw: _Raw) -> Iterator[str]:
+    """Sentences on what makes arrays no motion in metres and radians, z up."""
     n = len(raw.base)
     shapes = raw.base.shape == (n, 3) and raw.turn.shape == (n, 4)
     if not shapes or raw.joints.ndim != 2 or len(raw.joints) != n:
         sizes = f"{raw.base.shape}, {raw.turn.shape}, {raw.joints.shape}"
-        raise InputError(
-            f"{where}: base, quaternions and joints have shapes {sizes}; they must be (n, 3), "
-            f"(n, 4), (n, joints)"
+        yield (
+            f"base, quaternions and joints have shapes {sizes}; they must be (n, 3), (n, 4), "
+            f"(n, joints)"
         )
     if n < LEAST_FRAMES:
-        raise InputError(f"{where}: has {n} frames; a motion has {LEAST_FRAMES} or more")
+        yield f"has {n} frames; a motion has {LEAST_FRAMES} or more"
     whole = np.hstack([raw.base, raw.turn, raw.joints]).astype(float)
-    bad = np.argwhere(~np.isfinite(whole))
-    if len(bad):
-        frame, column = bad[0]
-        raise InputError(
-            f"{where}: frame {frame}, column {column} is not a finite number; repair it"
-        )
+    for frame, column in np.argwhere(~np.isfinite(whole)):
+        yield f"frame {frame}, column {column} is not a finite number; repair it"
     length = np.linalg.norm(raw.turn, axis=1)
-    if np.abs(length - 1).max() > 0.01:
-        frame = int(np.abs(length - 1).argmax())
-        raise InputError(
-            f"{where}: the quaternion of frame {frame} has length {length[frame]:.3g}, must be 1; "
-            "normalise it"
+    frame = int(np.abs(length - 1).argmax())
+    if abs(length[frame] - 1) > 0.01:
+        yield (
+            f"the quaternion of frame {frame} has length {length[frame]:.3g}, must be 1; "
+            f"normalise it"
         )
     most = np.abs(raw.joints).max()
     if most > TURN_RAD:
-        raise InputError(
-            f"{where}: joint angles up to {most:.0f}; they look like degrees: pass radians"
-        )
-    if np.median(np.abs(raw.base).max(axis=1)) > 50:
-        raise InputError(
-            f"{where}: the base is {np.abs(raw.base).max():.0f} m away; it looks like "
-            f"centimetres: pass metres"
-        )
-
-
-def _check_axes(where: str, raw: _Raw) -> None:
-    """Refuse quaternions w x y z, and worlds whose y points up."""
+        yield f"joint angles up to {most:.0f}; they look like degrees: pass radians"
+    away = np.abs(raw.base)
+    if np.median(away.max(axis=1)) > 50:
+        yield f"the base is {away.max():.0f} m away; it looks like centimetres: pass metres"
 
     def upright(turn: np.ndarray, axis: int = 2) -> float:
         return float(np.median(Rotation.from_quat(turn).as_matrix()[:, axis, 2]))
@@ -375,13 +377,11 @@ def _check_axes(where: str, raw: _Raw) -> None:
     if upright(raw.turn) > 0.5:
         return
     if upright(raw.turn, 1) > 0.9 and np.median(raw.base[:, 1]) > np.median(raw.base[:, 2]):
-        raise InputError(
-            f"{where}: the robot's up is the world's y; turn the clip so that z points up"
-        )
+        yield "the robot's up is the world's y; turn the clip so that z points up"
     if upright(_first_wxyz(raw.turn)) > 0.9:
-        raise InputError(
-            f"{where}: its quaternions, read as x y z w, lay the robot down or stand it on its "
-            f"head; read as w x y z they keep it upright: reorder them to x y z w"
+        yield (
+            "its quaternions, read as x y z w, lay the robot down or stand it on its head; read as "
+            "w x y z they keep it upright: reorder them to x y z w"
         )
 
 
@@ -434,28 +434,45 @@ def _siblings(robot: Robot) -> Iterator[Robot]:
             yield Robot.load(name)
 
 
-def _check_joints(where: str, robot: Robot, q: np.ndarray, unnamed: bool, order: str) -> None:
+def _check_order(where: str, raw: _Raw, robot: Robot, q: np.ndarray, order: str) -> float:
+    """Tilt of the lower sole (see :func:`_tilt`); refuses joints in an ``order`` with which soles
+    are tilted, if they are level in the other one.
+    """
+    tilt = _tilt(robot, q)
+    other = ORDERS[order == ORDERS[0]]
+    try:
+        again = _tilt(*_fitted(where, raw, robot, other))
+    except InputError:
+        return tilt
+    if again < min(LEVEL_RAD, FLATTER * tilt) and tilt > TILTED_RAD:
+        raise InputError(
+            f"{where}: in {order} order its lower sole is {tilt:.1f} rad off level half of the "
+            f"time, in {other} order {again:.1f} rad; pass order = {other!r}"
+        )
+    return tilt
+
+
+def _tilt(robot: Robot, q: np.ndarray) -> float:
+    """Median angle of the lower sole to the ground [rad], in configurations (n, nq)."""
+    data = robot.model.createData()
+    frames = [robot.model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames]
+    upright = []
+    for row in q[:: max(1, len(q) // LOOKED_AT)]:
+        pin.framesForwardKinematics(robot.model, data, row)
+        lower = min((data.oMf[k] for k in frames), key=lambda x: x.act(robot.foot.center)[2])
+        upright.append(lower.rotation[2, 2])
+    return float(np.arccos(min(1.0, np.median(upright))))
+
+
+def _check_joints(where: str, robot: Robot, q: np.ndarray) -> None:
     """Refuse joints that are out of their ranges most of the time: another order, or robot."""
     limits = robot.limits
-
-    def beyond(joints: np.ndarray) -> np.ndarray:
-        return np.median(np.maximum(limits.lower - joints, joints - limits.upper), axis=0)
-
-    off = beyond(q[:, 7:])
+    beyond = np.maximum(limits.lower - q[:, 7:], q[:, 7:] - limits.upper)
+    off = np.median(beyond, axis=0)
     worst = int(off.argmax())
-    if off[worst] <= BEYOND_RAD:
-        return
-    words = (
-        f"{where}: joint {robot.joint_names[worst]!r} is {off[worst]:.1f} rad beyond its range "
-        f"most of the time"
-    )
-    other = ORDERS[order == ORDERS[0]]
-    if unnamed:
-        names = [ordered(robot.urdf, x)[0] for x in (order, other)]
-        joints = q[:, [7 + names[1].index(name) for name in names[0]]]
-        if beyond(joints).max() < BEYOND_RAD:
-            raise InputError(f"{words}, but no joint is in {other} order; pass order = {other!r}")
-    raise InputError(
-        f"{words}: its joints are in another order, or the clip is of another robot; correct "
-        "the order, or pass that robot"
-    )
+    if off[worst] > BEYOND_RAD:
+        raise InputError(
+            f"{where}: joint {robot.joint_names[worst]!r} is {off[worst]:.1f} rad beyond its range "
+            f"most of the time: its joints are in another order, or the clip is of another robot; "
+            f"correct the order, or pass that robot"
+        )

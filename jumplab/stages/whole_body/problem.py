@@ -152,7 +152,7 @@ class Schedule:
         last = k == len(phases) - 1
         landed = self.landed(k)
         once = (int(k > 0 and not landed), 0)  # the phase before has the rows of a shared node
-        terms = [*smoothness(m), *dynamics(m, once), motor_lines(m, once)]
+        terms = [*smoothness(m, self.follows), *dynamics(m, once), motor_lines(m, once)]
         terms += [body_clearance(m), *sides_apart(m)]
         for side in m.sides:  # a first node that is given or shared needs no rows
             terms += foot_rows(m, side, not landed, side in landed)

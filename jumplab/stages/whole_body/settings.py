@@ -168,8 +168,11 @@ class Weights:
     follow_foothold: float = 2000.0
 
     def of_clip(self) -> Weights:
-        """The same for a motion that follows another one: what it costs counts less."""
-        return replace(self, acceleration=2e-4, jerk=3e-7, torque=5e-5)
+        """The same for a motion that follows another one: what it costs counts less.
+
+        Waist and arms are followed with the other joints; some more weight settles them sooner.
+        """
+        return replace(self, acceleration=2e-4, jerk=3e-7, torque=5e-5, posture=15.0)
 
     def of_size(self, size: Size) -> Weights:
         """Those of a robot of another ``size``: each term has the same share of the cost."""

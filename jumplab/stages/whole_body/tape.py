@@ -250,7 +250,8 @@ def _balanced(
     Where all feet that carry are on their toes, in one ``line``, no ground force has a moment about
     it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides the
     planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. The
-    shift of the base in a phase vanishes within it if the phase ``stays`` on the ground.
+    shift of the base in a phase vanishes within it if the phase ``stays`` on the ground; what leads
+    it back is in proportion to the squared load, so that it moves the centre of pressure least.
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
@@ -271,20 +272,23 @@ def _balanced(
         force, about = np.split(np.array(need) - wrench[rows], 2, axis=1)
         return np.hstack([force, about - np.cross(edge[:3], force)]) @ seen.T
 
+    def integrated(more: np.ndarray) -> np.ndarray:
+        rate = cumulative_trapezoid(more, t, axis=0, initial=0.0)
+        return np.array([cumulative_trapezoid(rate, t, axis=0, initial=0.0), rate, more])
+
     first = missing()
     # slopes hardly change, neither by the corrections nor from one sample to the next
     some = every if line else np.unique(np.append(every[::SLOPES], every[-1]))
     slopes = np.stack([missing(way, some) - first[some] for way in ways], axis=-1)
     back = np.linalg.pinv(slopes)[np.searchsorted(some, every)]
+    share = (t - t[0]) / (t[-1] - t[0])
+    load = np.maximum(wrench[:, 2], LEAST_LOAD * robot.total_mass * robot.gravity)
+    where = (share * (1 - share) * load**2)[:, None] * np.column_stack([0 * t + 1, share])
+    returning = integrated(where)
     for k in range(BALANCING + (not line)):
-        more = -np.matvec(back, missing() if k else first) @ ways
-        rate = cumulative_trapezoid(more, t, axis=0, initial=0.0)
-        place = cumulative_trapezoid(rate, t, axis=0, initial=0.0)
-        shift = np.array([place, rate, more])
+        shift = integrated(-np.matvec(back, missing() if k else first) @ ways)
         if stays and not line:
-            none = np.zeros(BASE)
-            ends = [(none, place[-1]), (none, rate[-1]), (none, none)]
-            shift -= quintic(ends, t[-1] - t[0], (t - t[0])[:, None])
+            shift -= returning @ np.linalg.solve(returning[:2, -1], shift[:2, -1])
         motion[..., :BASE] += shift
     return motion
 

@@ -44,13 +44,16 @@ WORTH = 1000.0
 CLEAR = {"scale": PLACE_SCALE, "group": "clearance"}
 
 
-def smoothness(m: Mode) -> list[Term]:
-    """Costs on accelerations, jerk, torques and forces."""
+def smoothness(m: Mode, follows: bool = False) -> list[Term]:
+    """Costs on accelerations, jerk, torques and forces, and on the waist's and the arms' way from
+    the stance, or from the motion that it ``follows``.
+    """
     w = m.weights
     origin = "WL-J2, WF-J2"
 
     def bent(p):
-        return p.tree.q[m.body.upper] - ca.DM(m.body.stance[m.body.upper])
+        near = p.ref.chart if follows else ca.DM(m.body.stance)
+        return (p.tree.q - near)[m.body.upper]
 
     def uneven(p):
         pairs = mirror(m.robot.model)
@@ -67,7 +70,7 @@ def smoothness(m: Mode) -> list[Term]:
             Term("force", "ours: spread", "N", "node", lambda p: p.z[: m.n_forces], w.force)
         )
     if m.body.upper:
-        straight = "ours: joints without a role stay near the stance"
+        straight = "ours: joints without a role stay near the stance, or what is followed"
         terms.append(Term("waist and arms", straight, "rad", "node", bent, w.posture))
     if not (m.robot.planar or m.free.even):
         even = "ours: a jump straight ahead is even"
