@@ -202,7 +202,8 @@ def record(
     robot : who jumps, or what :meth:`Robot.load` takes.
     what : "height_m", "distance_m", "platform_m", "side_m" or "yaw_rad".
     given : the rest of the target; by default a jump on the spot (a platform as near as it can be),
-        with whatever rise is best.
+        with whatever rise is best. With steps, or on one foot, only a height or a distance on level
+        ground has a record.
     share : of the record, of the plan that is played first; a smaller one follows where a robot
         falls.
     engines : in which it is played; none with ().
@@ -218,6 +219,12 @@ def record(
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
     if what not in EASY:
         raise InputError(f"what = {quoted(what)}: a record is one of {', '.join(EASY)}")
+    stepping = given is not None and not given.standing
+    if stepping and (what not in ("height_m", "distance_m") or given.platform_m):
+        raise InputError(
+            f"what = {quoted(what)}: after steps, or on one foot, only height_m and distance_m on "
+            f"level ground have a record; leave out takeoff, landing and run_up"
+        )
     if not 0 < share <= 1:
         raise InputError(f"share = {share:g} must be above 0 and at most 1")
     for engine in engines:
@@ -232,7 +239,9 @@ def record(
         share, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
-    bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
+    bound = math.inf
+    if plan.task.standing:
+        bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
     if given is None and not any(changes.values()):
         keep_record(robot, what, value)
     made = plan, plan.audit, found, ends, share, runs
@@ -245,7 +254,7 @@ class _Search:
 
     def __init__(self, planner: Planner, what: str, given: JumpTask | None):
         self.planner = planner
-        self.stage = planner.stage("direct")
+        self.stage = planner.stage("direct") if given is None else planner.direct(given)
         self.what = what
         self.given = given or _usual(self.stage.body, what)
         names = [name for name, field in SOUGHT.items() if field == what]
@@ -301,7 +310,9 @@ class _Search:
         """Refuse a record that a number of the problem ends, not the robot."""
         least, longest = self.stage.limits.flight_s
         who = f"robot {self.planner.robot.name}: the record of {self.what} is limited by"
-        if solved.solution.phases["flight"].duration > (1 - NEAR_END) * longest:
+        contacts = self.stage.contacts
+        flight = contacts.phases[contacts.last_flight].name
+        if solved.solution.phases[flight].duration > (1 - NEAR_END) * longest:
             raise InfeasibleError(
                 f"{who} the flight of {longest:g} s, the longest that plans may have, not by the "
                 f"robot; allow more by limits={{'flight_s': ({least:g}, {2 * longest:g})}}",

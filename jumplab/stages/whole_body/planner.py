@@ -29,19 +29,17 @@ from jumplab.stages.whole_body.plan import WholeBodyPlan
 from jumplab.stages.whole_body.program import Program, Solved
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.starts import (
+    ALONG,
     ASIDE,
     COLD,
     COMPARED,
     FROM_NEIGHBOUR,
     GIVEN,
     IN_PLANE,
-    LONG_SCHEDULE,
     MENDED,
     NEIGHBOUR,
     REFINED,
     SETTLED,
-    SHORT,
-    SHORT_SCHEDULE,
     STANCE,
     Asked,
     Attempt,
@@ -273,7 +271,7 @@ class WholeBodyPlanner:
         ramp = aside and not turns and asked.straight is not None
         cold = IN_PLANE if program.free.plane else ASIDE if ramp else COLD
         if self.contacts.ends == "rest":
-            cold = SHORT_SCHEDULE if len(self.contacts.phases) <= SHORT else LONG_SCHEDULE
+            cold = ALONG
         near = FROM_NEIGHBOUR if asked.near is not None else ()
         given = GIVEN if asked.motion is not None else ()
         if task.rotation_rad:  # a body that turns over has no places for its feet

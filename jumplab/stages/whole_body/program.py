@@ -34,6 +34,7 @@ from jumplab.stages.whole_body.shapes import Apart
 from jumplab.stages.whole_body.starts import (
     AFTER_ROUGH,
     APART,
+    HELD_AFTER_ROUGH,
     Asked,
     Beginning,
     Start,
@@ -230,7 +231,8 @@ class Program(Shown):
             if rows == begin.apart and (number or not start.rough):
                 break
             begin = replace(begin, apart=rows)
-            again = AFTER_ROUGH[min(number, 1)] if start.rough else APART[not held]
+            after_rough = HELD_AFTER_ROUGH if start.held else AFTER_ROUGH
+            again = after_rough[min(number, 1)] if start.rough else APART[not held]
             try:
                 solved = self.solve(asked, again, begin)
             except SolverError:
@@ -295,7 +297,7 @@ class Program(Shown):
         Raises :class:`InfeasibleError` if a sole would stand across its edge.
         """
         if self.contacts.ends == "rest":
-            return surface_of_schedule(self.body, self.limits, self.contacts)
+            return surface_of_schedule(self.body, self.limits, self.contacts, task)
         return surface_of_jump(self.body, self.limits, task)
 
     def parameters(
