@@ -1,4 +1,4 @@
-"""Targets that name the feet of take-off and landing, and the steps of a run-up: their schedule, plan, audit and words."""
+"""Targets that name the feet of take-off and landing, and the steps of a run-up: schedule, plan, audit, words."""
 
 from dataclasses import replace
 from functools import cache
@@ -126,7 +126,7 @@ def test_the_audit_sees_another_distance_and_rise(change, failed):
 def test_another_target_begins_with_its_plan():
     plan = hop()
     further = Planner(plan.robot).replan(plan, replace(OFF_THE_LEFT, distance_m=0.3))
-    assert [x.start for x in further.attempts][0] == "neighbour"
+    assert further.attempts[0].start == "neighbour"
     assert further.planned_distance_m == pytest.approx(0.3, abs=1e-3)
 
 
@@ -154,9 +154,9 @@ def test_what_only_a_jump_from_a_stand_has(bhr):
     with pytest.raises(InputError) as e:
         jl.plan(OFF_THE_LEFT, method="three-step")
     assert str(e.value) == said + "choose 'direct', or leave out takeoff, landing and run_up"
-    with pytest.raises(InputError, match="^starts = 2: only method 'direct' compares several starts, and only in "):
+    with pytest.raises(InputError, match=r"^starts = 2: only method 'direct' compares several starts, and only in "):
         Planner(bhr).plan(OFF_THE_LEFT, starts=2)
-    with pytest.raises(InputError, match="^takeoff, landing and run_up: a jump like a clip, or one that allows for "):
+    with pytest.raises(InputError, match=r"^takeoff, landing and run_up: a jump like a clip, or one that allows for "):
         jl.plan(OFF_THE_LEFT, robust=Ranges())
 
 
