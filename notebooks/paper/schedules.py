@@ -14,15 +14,19 @@ from matplotlib.figure import Figure
 from scipy.integrate import trapezoid
 
 import jumplab as jl
-from jumplab.errors import SolverError
+from jumplab import sim
+from jumplab.errors import JumplabError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, by_phase, new_figure
 from jumplab.stages.plan import JumpPlan, planned
+from jumplab.studies import trials
 from paper import logs
 
 LOG = Path(__file__).with_name("schedules.jsonl")
+PERTURBED = Path(__file__).with_name("schedules_perturbed.jsonl")
 ROBOTS = "bhr", "g1_arms"
+FIRST_SHARE, LAST_SHARE = 0.1, 0.02  # of the standing record, by which a longer flight is sought
 PATIENCE_S = 40.0  # processor time for one plan
 # name -> words of Contacts.named
 CASES = {
@@ -83,6 +87,47 @@ def _row(folder: Path, robot: str, case: str) -> dict[str, Any]:
     return row
 
 
+def perturbed(folder: str | Path, n: int = 30, path: Path = PERTURBED, robots: Iterable[str] = ROBOTS) -> None:
+    """Let ``n`` perturbed robots play each plan that :func:`study` kept in ``folder``, in each engine; one row each.
+
+    Trials of a plan are kept beside it: an interrupted run, or one of more robots, goes on where the other ended.
+    ``python -m paper.schedules DIR N`` calls it.
+    """
+    with logs.keep(path, itemgetter("robot", "case", "engine", "n")) as log:
+        for robot, case, engine in product(robots, CASES, sim.INSTALLED):
+            place = Path(folder) / f"{robot} {case}"
+            if (robot, case, engine, n) in log.done or not (place / "plan.npz").is_file():
+                continue
+            settings = trials.TrialSettings(engine=engine)
+            report = trials.run_trials(place, n, settings=settings, jobs=1, progress=False)
+            row = {"robot": robot, "case": case, "engine": engine, "n": n, "landed": report.landed}
+            log.add(row | {"causes": report.causes})
+
+
+def furthest(robot: str, rise_m: float, run_up: int = 2) -> dict[str, Any]:
+    """The record of the standing jump with a rise [m], and the longest flight off one foot after a run-up, by plans
+    each of which begins with the one before, is up to a tenth longer, and passes its audit.
+    """
+    humanoid = jl.Robot.load(robot)
+    stand = jl.record(humanoid, "distance_m", jl.JumpTask(0.0, rise_m), engines=())
+    planner = jl.Planner(humanoid, keep=True)
+    share, step, best = 0.5, FIRST_SHARE, None
+    while step > LAST_SHARE:
+        task = jl.JumpTask(share * stand.value, rise_m, takeoff="left", run_up=run_up)
+        try:
+            plan = planner.plan(task) if best is None else planner.replan(best, task)
+        except JumplabError:
+            plan = None
+        if plan is not None and plan.audit.passed:
+            best = plan
+        else:
+            share -= step
+            step /= 2
+        share += step
+    found = {"robot": robot, "rise_m": rise_m, "stand_m": stand.value, "stand_best_m": stand.best}
+    return found | {"run_up_m": 0.0 if best is None else best.task.distance_m, "plan": best}
+
+
 def _planned(folder: Path, robot: str, words: str) -> JumpPlan:
     if (folder / "plan.npz").is_file():
         return jl.load(folder).plan
@@ -139,4 +184,7 @@ def speeds(plans: dict[str, JumpPlan]) -> Figure:
 
 
 if __name__ == "__main__":
-    study(*sys.argv[1:2])
+    if sys.argv[2:]:
+        perturbed(sys.argv[1], int(sys.argv[2]))
+    else:
+        study(*sys.argv[1:2])

@@ -129,8 +129,8 @@ def motor_lines(m: Mode, skip: tuple[int, int]) -> Term:
 
 
 def body_clearance(m: Mode) -> Term:
-    """Knees and hands stay away from the ground, and shanks from a platform that they are to be
-    brought onto.
+    """Knees and hands stay away from the ground, and shanks from an edge that they go onto, or
+    over.
     """
     body = m.body
     lim = m.limits
@@ -141,14 +141,22 @@ def body_clearance(m: Mode) -> Term:
     shanks = [spot for spot in body.shank_points if spot[0] in counted]
     face = body.shank_m + lim.shank_clearance_m
 
+    def beside(p, x, step, drop):
+        """Height that a shank needs beyond an edge up, and about an edge down: behind it, the
+        feet keep it up.
+        """
+        near = p.over_edge(x, face)
+        return step * near + drop * (near - p.over_edge(x, -face))
+
     def heights(p):
         lowest = ca.fmin(p.p.platform, 0)
         step = (p.p.platform > 0) * (p.p.platform + face)
+        drop = (p.p.platform < 0) * (face - p.p.platform)
         points = [p.tree.point(*spot) for spot, _ in limbs]
         faces = [p.tree.point(*spot) for spot in shanks]
         return ca.vertcat(
             *(x[2] - p.ground(x, lim.edge_clearance_m) for x in points),
-            *(x[2] - lowest - step * p.over_edge(x, face) for x in faces),
+            *(x[2] - lowest - beside(p, x, step, drop) for x in faces),
         )
 
     least = np.array([least for _, least in limbs] + [0.0] * len(shanks))
