@@ -130,7 +130,8 @@ def _advice(
         tell(f"refused; trying {tried[-1]}")
         refusal = refused(planner, easier, method)
         if refusal is None:
-            return f"ask for {tried[-1]}, which has a plan{_run_up(planner, task, easier)}"
+            other = _run_up(planner, task, easier) if steps == 1 else ""  # where time is left
+            return f"ask for {tried[-1]}, which has a plan{other}"
     if not tried:
         return "no easier target was tried"
     return f"none of the easier targets that were tried has a plan either: {'; '.join(tried)}"
