@@ -12,6 +12,7 @@ from jumplab.auditing import audit
 from jumplab.auditing.replay import replay
 from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.robot_import.urdf import have_published
 from jumplab.sim import INSTALLED
 
 AIR, TOE, FLAT = 0, 1, 2
@@ -126,6 +127,14 @@ def test_after_a_step_down_the_cop_is_judged_at_the_height_of_the_lower_ground(b
         f[k, 0, 3:] = np.cross(at - place.translation, f[k, 0, :3])
         cop = audit(replace(tape, f=f), plan.robot, plan.task, edge_m=plan.whole_body.edge_m)["CoP in the sole"]
         assert cop.value == pytest.approx(1e3 * beyond_m, abs=1e-3) and cop.passed == (beyond_m < 0.002)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
+def test_shanks_keep_off_an_edge_that_the_robot_steps_down_from():
+    plan = jl.plan(robot="g1_arms", contacts="step_off=0.3")
+    assert plan.audit.passed, plan.audit.table()
+    assert plan.audit["body clearance"].value > 1e3 * plan.whole_body.limits.shank_clearance_m
 
 
 @pytest.mark.parametrize("engine", INSTALLED)
