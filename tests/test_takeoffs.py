@@ -160,6 +160,17 @@ def test_what_only_a_jump_from_a_stand_has(bhr):
         jl.plan(OFF_THE_LEFT, robust=Ranges())
 
 
+def test_records_after_steps_are_of_rise_and_distance_on_level_ground(bhr):
+    run = jl.JumpTask(0.3, 0.1, takeoff="left", run_up=2)
+    for what, given in (("platform_m", run), ("distance_m", replace(run, platform_m=0.1))):
+        with pytest.raises(InputError) as e:
+            jl.record(bhr, what, given)
+        assert str(e.value) == (
+            f"what = {what!r}: after steps, or on one foot, only height_m and distance_m on level ground have a "
+            "record; leave out takeoff, landing and run_up"
+        )
+
+
 def test_an_edge_under_the_feet_is_refused_with_the_phase(bhr):
     onto = jl.JumpTask(0.2, 0.3, 0.2, takeoff="left", run_up=1)
     with pytest.raises(InfeasibleError) as e:

@@ -263,17 +263,23 @@ class _Search:
         self.sought = tuple(names)
 
     def program(self, task: JumpTask) -> Program:
-        """The one in which the number is an unknown, on a mesh of which little is left to gain."""
-        return self.stage.seeking(self.stage.program(task), self.sought).finer
+        """The one in which the number is an unknown, on a mesh of which little is left to gain; of
+        steps, which are three times as long, on the usual one.
+        """
+        seeking = self.stage.seeking(self.stage.program(task), self.sought)
+        return seeking.finer if self.given.standing else seeking
 
     def starts(self, best: list[tuple]) -> Iterator[JumpTask]:
-        """Jumps to begin with: easy ones (:data:`EASY`), then shares of the ``best`` one."""
+        """Jumps to begin with: easy ones (:data:`EASY`), then shares of the ``best`` one; after
+        steps, where each takes a minute or more, the middle one of them alone.
+        """
         leg = self.stage.body.leg_m
-        for number, rise in EASY[self.what]:
+        alone = not self.given.standing
+        for number, rise in EASY[self.what][alone : 2 if alone else None]:
             x = number if self.what == "yaw_rad" else number * leg
             more = {"height_m": rise * leg} if "takeoff_speed" in self.sought else {}
             yield replace(self.given, **(more | {self.what: x}))
-        for share in CLIMB if best else ():
+        for share in CLIMB if best and not alone else ():
             yield self.at(max(best, key=lambda x: x[0])[1], share)
 
     def from_easy(self) -> tuple[dict[str, float], Solved]:
@@ -287,7 +293,9 @@ class _Search:
             tell(f"record of {self.planner.robot.name} from {word}")
             found[word] = math.nan
             try:
-                near = self.stage.solved(task)
+                # after steps links meet, and a record begins with their rows
+                begin = self.stage.solved if task.standing else self.stage.plan
+                near = begin(task)
                 program = self.program(task)
                 solved = program.solve_apart(Asked(task, near=near), SEEKING)
             except (InfeasibleError, SolverError) as e:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
@@ -15,7 +17,7 @@ from scipy.integrate import trapezoid
 
 import jumplab as jl
 from jumplab import sim
-from jumplab.errors import JumplabError, SolverError
+from jumplab.errors import SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, by_phase, new_figure
@@ -24,9 +26,10 @@ from jumplab.studies import trials
 from paper import logs
 
 LOG = Path(__file__).with_name("schedules.jsonl")
+LONGEST = Path(__file__).with_name("run_up_records.jsonl")
 PERTURBED = Path(__file__).with_name("schedules_perturbed.jsonl")
 ROBOTS = "bhr", "g1_arms"
-FIRST_SHARE, LAST_SHARE = 0.1, 0.02  # of the standing record, by which a longer flight is sought
+RISE_M = 0.1  # of the jumps whose distance is a record
 PATIENCE_S = 40.0  # processor time for one plan
 # name -> words of Contacts.named
 CASES = {
@@ -104,28 +107,21 @@ def perturbed(folder: str | Path, n: int = 30, path: Path = PERTURBED, robots: I
             log.add(row | {"causes": report.causes})
 
 
-def furthest(robot: str, rise_m: float, run_up: int = 2) -> dict[str, Any]:
-    """The record of the standing jump with a rise [m], and the longest flight off one foot after a run-up, by plans
-    each of which begins with the one before, is up to a tenth longer, and passes its audit.
+def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = ROBOTS) -> None:
+    """The longest standing jump with a rise of :data:`RISE_M`, and the longest flight with it off one foot after a
+    run-up of two steps; one row each, plans kept in ``folder``. ``python -m paper.schedules DIR records`` calls it.
     """
-    humanoid = jl.Robot.load(robot)
-    stand = jl.record(humanoid, "distance_m", jl.JumpTask(0.0, rise_m), engines=())
-    planner = jl.Planner(humanoid, keep=True)
-    share, step, best = 0.5, FIRST_SHARE, None
-    while step > LAST_SHARE:
-        task = jl.JumpTask(share * stand.value, rise_m, takeoff="left", run_up=run_up)
-        try:
-            plan = planner.plan(task) if best is None else planner.replan(best, task)
-        except JumplabError:
-            plan = None
-        if plan is not None and plan.audit.passed:
-            best = plan
-        else:
-            share -= step
-            step /= 2
-        share += step
-    found = {"robot": robot, "rise_m": rise_m, "stand_m": stand.value, "stand_best_m": stand.best}
-    return found | {"run_up_m": 0.0 if best is None else best.task.distance_m, "plan": best}
+    stand = jl.JumpTask(0.0, RISE_M)
+    asked = {"stand": stand, "run-up": replace(stand, takeoff="left", run_up=2)}
+    with logs.keep(path, itemgetter("robot", "from")) as log:
+        for robot, name in product(robots, asked):
+            if (robot, name) in log.done:
+                continue
+            began = time.process_time()
+            found = jl.record(robot, "distance_m", asked[name], engines=())
+            jl.save(Path(folder) / f"{robot} record {name}", found.plan)
+            row = {"robot": robot, "from": name, "distance_m": found.value, "at_nodes_m": found.best}
+            log.add(row | {"cpu_s": round(time.process_time() - began, 1), "line": found.line()})
 
 
 def _planned(folder: Path, robot: str, words: str) -> JumpPlan:
@@ -184,7 +180,9 @@ def speeds(plans: dict[str, JumpPlan]) -> Figure:
 
 
 if __name__ == "__main__":
-    if sys.argv[2:]:
+    if sys.argv[2:] == ["records"]:
+        records(sys.argv[1])
+    elif sys.argv[2:]:
         perturbed(sys.argv[1], int(sys.argv[2]))
     else:
         study(*sys.argv[1:2])
