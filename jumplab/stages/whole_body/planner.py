@@ -39,6 +39,7 @@ from jumplab.stages.whole_body.starts import (
     MENDED,
     NEIGHBOUR,
     REFINED,
+    REFINED_ALONG,
     SETTLED,
     STANCE,
     Asked,
@@ -288,12 +289,14 @@ class WholeBodyPlanner:
         """
         solved = program.solve_apart(asked, start)
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
+        along = self.contacts.ends == "rest" and not program.follows
         # what is followed is settled
-        for further in REFINED[program.follows :]:
-            late = further is not SETTLED and asked.spent_s > program.left_s(asked)
+        for further in REFINED_ALONG if along else REFINED[program.follows :]:
+            settles = further.name == SETTLED.name
+            late = not settles and asked.spent_s > program.left_s(asked)
             if best.used <= 1 or (late and best.used > HOPELESS) or program.spent(asked):
                 break
-            program = program if further is SETTLED else program.finer
+            program = program if settles else program.finer
             try:
                 solved = program.solve_apart(replace(asked, near=solved), further)
             except SolverError:

@@ -292,4 +292,8 @@ SEEKING = Start("easy jump", from_neighbour, False, 300, WARM | EXACT | FAR_OFF)
 RECORD = Start("record", from_neighbour, False, 150, WARM | EXACT | {"mu_init": 1e-4})
 SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
 FINER = Start("finer mesh", from_neighbour, False, 150, WARM | {"acceptable_iter": 1})
+# of schedules, in half of the time of the exact Hessian
+CLOSER = {"mu_init": 1e-4, "acceptable_iter": 5, "acceptable_obj_change_tol": 5e-4}
+HELD_SETTLED = replace(SETTLED, held=True, patience=60, options=NEAR | CLOSER)
+REFINED_ALONG = (HELD_SETTLED, SETTLED, FINER, FINER)
 REFINED = (SETTLED, FINER, FINER, FINER)  # the last one for flips of robots with a waist
