@@ -263,7 +263,8 @@ DRAWN = replace(COLD[0], patience=100, options=QUICK | ROUGH)
 # shares of a schedule, solved one after the other, each from the one before
 EASED = 1 / 3, 2 / 3
 LESS = Start("eased schedule", from_eased, True, 100, NEAR)
-ALONG = (DRAWN, LESS, *COLD[1:])
+# one that leads somewhere has done so after 40 steps
+ALONG = (replace(DRAWN, patience=50), LESS, *COLD[1:])
 FOLLOWED = (Start("given motion", from_motion, False, 120, QUICK | ROUGH),)
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, from_neighbour, True, 100, NEAR),
