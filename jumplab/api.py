@@ -73,7 +73,7 @@ def plan(
 
     Parameters
     ----------
-    task : what to reach, in a jump from a stand; or else
+    task : what to reach, from a stand, or by the steps and feet that it names; or else
     contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of
         your own; or the words of :meth:`Contacts.named`, such as "hop=0.2". It is planned by the
         whole-body program, and audited foot by foot.
@@ -110,9 +110,15 @@ def plan(
             "give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)"
         )
     along = contacts is not None or like is not None
+    steps = task is not None and not task.standing
+    if steps and (like is not None or robust is not None):
+        raise InputError(
+            "takeoff, landing and run_up: a jump like a clip, or one that allows for other robots, "
+            "is from a stand; leave them out, or like and robust"
+        )
     if patience_s is None:
         once = ROBUST_S if robust is not None else USUAL_S
-        patience_s = SCHEDULE_S if along else starts * once
+        patience_s = SCHEDULE_S if along or steps else starts * once
     if along:
         alone = robust is None and method == USUAL and starts == 1
         if not (alone and (contacts is None or like is None)):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Self
 
 from jumplab.arguments import checked, real
-from jumplab.errors import InputError, Shown
+from jumplab.errors import InputError, Shown, quoted
 
 GRAVITY = 9.8  # [m/s^2], the paper's value; every model of the package uses it
 # [1] that every stage counts on at its nodes; between them, the audit refuses what trials may not
@@ -31,6 +31,8 @@ RANGES = {
     "yaw_rad": ("yaw", -2 * math.pi, 2 * math.pi),
 }
 UNITS = {"m": "m", "rad": "rad", "gravity": "m/s^2"}  # by the ends of names
+FEET = ("left", "right", "both")
+MOST_STEPS = 30  # steps or jumps in a row; a program of more is too large to solve
 
 
 def _number(name: str, value: Any, low: float, high: float, unit: str) -> float:
@@ -57,6 +59,10 @@ class JumpTask(Shown):
     yaw_rad : turn about the vertical, counter-clockwise seen from above [rad]; ``distance_m`` and
         ``side_m`` stay in the axes of the start, and are then those of the middle between the
         soles.
+    takeoff, landing : the feet that leave last and come down first, "left", "right" or "both"; on
+        one foot, the other one follows. To the side they may then be 5 cm off.
+    run_up : steps before take-off, from the stand. Then, as with one foot, ``distance_m`` counts
+        from where the feet leave: it is what the last flight covers.
     """
 
     distance_m: float
@@ -66,6 +72,9 @@ class JumpTask(Shown):
     gravity: float = GRAVITY
     side_m: float = 0.0
     yaw_rad: float = 0.0
+    takeoff: str = "both"
+    landing: str = "both"
+    run_up: int = 0
 
     def __post_init__(self):
         for name, (words, low, high) in RANGES.items():
@@ -78,6 +87,47 @@ class JumpTask(Shown):
                 f"rotation = {math.degrees(self.rotation_rad):g} deg: the robot lands on its feet "
                 f"only after a multiple of 360 deg; nearest is {360 * round(turns):g} deg"
             )
+        self._check_feet()
+
+    def _check_feet(self) -> None:
+        """Refuse feet and steps that cannot be."""
+        for name in ("takeoff", "landing"):
+            word = getattr(self, name)
+            if not isinstance(word, str) or word not in FEET:
+                raise InputError(f"{name} = {quoted(word)}: choose one of {', '.join(FEET)}")
+        steps = real(self.run_up, "run_up")
+        if not (0 <= steps <= MOST_STEPS and steps.is_integer()):
+            raise InputError(
+                f"run_up = {quoted(self.run_up)} must be a whole number of steps, 0 to {MOST_STEPS}"
+            )
+        object.__setattr__(self, "run_up", int(steps))
+        if self.standing:
+            return
+        if self.rotation_rad or self.yaw_rad:
+            turn = "rotation" if self.rotation_rad else "yaw"
+            raise InputError(
+                f"{turn}: only a jump from a stand, off both feet and onto both, turns; leave out "
+                f"takeoff, landing and run_up, or the {turn}"
+            )
+        if self.run_up and self.distance_m < 0:
+            raise InputError(
+                f"run_up = {self.run_up} with a distance of {self.distance_m:g} m: a run-up goes "
+                f"ahead, so the distance must be 0 or more"
+            )
+
+    @property
+    def standing(self) -> bool:
+        """Whether the jump is from a stand, off both feet and onto both."""
+        return self.takeoff == self.landing == "both" and not self.run_up
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Its fields by name, as files and keys of studies have them: of a jump from a stand
+        without feet and steps.
+        """
+        left_out = ("takeoff", "landing", "run_up") if self.standing else ()
+        names = (f.name for f in fields(self) if f.name not in left_out)
+        return {name: getattr(self, name) for name in names}
 
     @classmethod
     @checked
@@ -100,9 +150,10 @@ class JumpTask(Shown):
     @property
     def along_rad(self) -> float:
         """Direction of the travel seen from above [rad], along which a platform begins; zero
-        straight ahead or back.
+        straight ahead or back, and behind steps or a take-off from one foot.
         """
-        return math.atan2(self.side_m, self.distance_m) if self.side_m else 0.0
+        aside = self.side_m and self.standing
+        return math.atan2(self.side_m, self.distance_m) if aside else 0.0
 
     @property
     def takeoff_speed(self) -> float:

@@ -184,8 +184,8 @@ WRITE = "write L and R for flat feet, l and r for toes, left before right, or '-
 WAIT = "a schedule must begin at rest on flat feet, where the robot can wait; begin with 'LR'"
 ALONE = "the schedule begins on one foot without a place for the"
 AFTER = "a foot lands only after it has left the ground"
-STEP = "the ground can have only one step up or down; "
-STEP += "give all places after the step the same up_m, and all before it none"
+STEP = "the ground can have only one step up or down: "
+STEP += "give all places after it the same up_m, and all before it none"
 CAME = "feet come down 2 times (left in phase '4 LR', right in phase '4 LR')"
 
 
@@ -239,8 +239,14 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
         (lambda: schedule("R - R", 1), f"phase '1 R': {ALONE} left one; begin with 'LR'"),
         (lambda: schedule("LR lr - LR", 1), f"places: 1 given, but {CAME}; {AFTER}"),
         (lambda: schedule("LR lr LR", 2), f"places: 2 given, but feet come down 0 times (none); {AFTER}"),
-        (lambda: stairs("LR - LR", 0.2, 0.3), f"places at the heights 0.2, 0.3 m: {STEP}"),
-        (lambda: stairs("LR - LR - LR", 0.2, 0.2, 0.0, 0.0), f"places at the heights 0.2, 0.2, 0, 0 m: {STEP}"),
+        (
+            lambda: stairs("LR - LR", 0.2, 0.3),
+            f"phase '3 LR': the left foot comes down 0.2 m high, in places at the heights 0.2, 0.3 m; {STEP}",
+        ),
+        (
+            lambda: stairs("LR - LR - LR", 0.2, 0.2, 0.0, 0.0),
+            f"phase '3 LR': the left foot comes down 0.2 m high, in places at the heights 0.2, 0.2, 0, 0 m; {STEP}",
+        ),
     ],
 )
 def test_refused(make, sentence):

@@ -267,7 +267,7 @@ def doubted(monkeypatch, bhr):
 
     def said(*shares: float) -> None:
         told = chain(shares, repeat(shares[-1]))
-        monkeypatch.setattr(ended, "used_between", lambda tape, robot, surface: next(told))
+        monkeypatch.setattr(ended, "used_between", lambda tape, robot, surface, body: next(told))
 
     return last, known, said
 

@@ -64,7 +64,7 @@ def audit(
     manifest = {
         "robot": robot.name,
         "robot_hash": robot.hash,
-        "target": dataclasses.asdict(task) if task else None,
+        "target": task.numbers if task else None,
         "samples": len(tape.t),
         "versions": versions(),
     }

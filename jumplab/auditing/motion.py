@@ -132,6 +132,8 @@ def target(r: Replay) -> Iterator[Measure]:
         yield "start at rest", np.abs(tape.v[:1]), tape.t[:1], names
     if not r.is_jump:
         yield "end at rest", np.abs(tape.v[-1:]), end, names
+        if r.task and not r.task.standing:
+            yield from _flown(r, r.task)
     elif r.task:
         yield from _asked(r, r.task)
 
@@ -185,20 +187,38 @@ def _place(r: Replay, task: JumpTask) -> Iterator[Measure]:
 def _asked(r: Replay, task: JumpTask) -> Iterator[Measure]:
     t = r.tape.t
     feet = r.tape.contact_frames
-    takeoff = r.flights[0].start
     if task.in_plane:
         travel = (r.toe_corners[-1] - r.toe_corners[0]).mean(axis=1)[:, :2]  # (K, 2)
         numbers = {"found": travel[:, 0].mean(), "asked": task.distance_m}
         yield "distance", norm(travel - [task.distance_m, 0.0])[None], t[-1:], feet, numbers
     else:
         yield from _place(r, task)
-    highest = int(np.argmax(r.com[takeoff:, 2])) + takeoff
-    rise = r.com[highest, 2] - r.com[takeoff, 2]
-    numbers = {"found": rise, "asked": task.height_m}
-    yield "rise", abs(rise - task.height_m), t[highest], None, numbers
+    yield from _risen(r, task, slice(r.flights[0].start, None))
     turn = foot_turn(r)
     numbers = _degrees(turn, task.rotation_rad)
     yield "rotation", np.abs(turn - task.rotation_rad)[None], t[-1:], feet, numbers
+
+
+def _risen(r: Replay, task: JumpTask, flight: slice) -> Iterator[Measure]:
+    """Rise of the CoM in a flight."""
+    height = r.com[flight, 2]
+    highest = int(np.argmax(height))
+    rise = height[highest] - height[0]
+    numbers = {"found": rise, "asked": task.height_m}
+    yield "rise", abs(rise - task.height_m), r.tape.t[flight][highest], None, numbers
+
+
+def _flown(r: Replay, task: JumpTask) -> Iterator[Measure]:
+    """Distance and rise of the last flight, after steps or off one foot: ahead of where the feet
+    stood first, against those that leave.
+    """
+    t = r.tape.t
+    off = r.flights[-1].start
+    ahead = r.toe_corners[[off, -1], ..., 0].mean(axis=-1) - r.toe_corners[0, ..., 0].mean(axis=-1)
+    flown = ahead[1] - ahead[0, r.carrying[off - 1]].mean()
+    numbers = {"found": flown.mean(), "asked": task.distance_m}
+    yield "distance", np.abs(flown - task.distance_m)[None], t[-1:], r.tape.contact_frames, numbers
+    yield from _risen(r, task, r.flights[-1])
 
 
 def _degrees(turn: np.ndarray, asked: float) -> dict[str, float]:

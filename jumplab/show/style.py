@@ -314,4 +314,9 @@ def describe_task(task: JumpTask) -> str:
         words.append(f"landing {abs(task.platform_m):.2f} m {level}")
     if task.rotation_rad:
         words.append(f"rotation {np.degrees(task.rotation_rad):.0f} deg")
+    if task.run_up:
+        words.append(f"run-up of {task.run_up} step{'s' * (task.run_up > 1)}")
+    for word, feet in (("take-off from", task.takeoff), ("landing on", task.landing)):
+        if feet != "both":
+            words.append(f"{word} the {feet} foot")
     return ", ".join(words)

@@ -21,6 +21,7 @@ from jumplab.stages.reconstruction import planar_columns
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body import Contacts, WholeBodyPlan
 from jumplab.stages.whole_body.starts import Attempt
+from jumplab.stages.whole_body.tape import feet_of
 from jumplab.task import JumpTask
 
 if TYPE_CHECKING:  # loaded with the first audit
@@ -87,6 +88,8 @@ class JumpPlan(Shown, Named):
         summary = planned(tape) | _summary(robot, method, tape, body, srmp, joints)
         if contacts is not None:
             summary["contacts"] = [p.feet for p in contacts.phases]
+            if contacts.aimed:
+                summary["planned_distance_m"] = flown(tape, robot)
         return cls(body.task, robot, method, tape, summary, srmp, joints, body, contacts)
 
     @classmethod
@@ -170,7 +173,8 @@ class JumpPlan(Shown, Named):
     @property
     def planned_distance_m(self) -> float:
         """Travel of the toe over the whole tape, of the middle between the soles in a jump out of
-        the plane [m].
+        the plane [m]; of a target with steps, or a take-off or a landing on one foot, of the last
+        flight.
         """
         return self.summary["planned_distance_m"]
 
@@ -260,6 +264,17 @@ def planned(tape: Tape) -> dict[str, float]:
     return {"planned_distance_m": ahead, **high, **aside}
 
 
+def flown(tape: Tape, robot: Robot) -> float:
+    """Distance ahead [m] that the last flight covers: of the feet in the end, from where they stood
+    first, less that of those that leave.
+    """
+    off = tape.flights[-1].start
+    origin, turn = feet_of(robot, tape.q[[0, off, -1]])
+    toes = (origin + turn @ robot.foot.tip)[..., 0]  # (3, 2)
+    ahead = toes[1:] - toes[0]
+    return float(ahead[1].mean() - ahead[0, tape.contacts[off - 1] > 0].mean())
+
+
 def _summary(
     robot: Robot,
     method: str,
@@ -293,7 +308,7 @@ def _summary(
         rows.append(StageRow(f"{stage}, {x.start}, {x.hessian}", x.iterations, build_s, x.cpu_s))
         build_s = 0.0
     return {
-        "target": asdict(body.task),
+        "target": body.task.numbers,
         "method": method,
         "robot": {"name": robot.name, "hash": robot.hash, "mass_kg": robot.total_mass},
         "launch_s": body.launch_s,

@@ -120,6 +120,7 @@ class Planner(Shown):
         for kind in self._given:
             self._settings(kind, False)  # refuses what does not fit
         self._stages: dict[tuple[str, bool], Any] = {}
+        self._stepping: WholeBodyPlanner | None = None
         self.token = os.getpid(), next(_COUNT)  # the same in copies that other processes get
 
     def line(self) -> str:
@@ -133,7 +134,7 @@ class Planner(Shown):
 
     def __getstate__(self) -> dict[str, Any]:
         kept = {k: v for k, v in vars(self).items() if k != "_model"}
-        return {**kept, "_stages": {}}  # another process builds its own
+        return {**kept, "_stages": {}, "_stepping": None}  # another process builds its own
 
     def _settings(self, kind: type, flip: bool) -> Any:
         """Limits, stage 1's settings or mesh, of jumps or of flips."""
@@ -184,7 +185,20 @@ class Planner(Shown):
         """The whole-body program that plans a target directly; ``weights`` as in :meth:`plan`
         ("term" -> weight).
         """
-        return self.stage("direct", flip=bool(task.rotation_rad)).program(task, weights)
+        return self.direct(task).program(task, weights)
+
+    @in_turn
+    def direct(self, task: JumpTask) -> WholeBodyPlanner:
+        """The direct planner of a target: that of jumps or of flips from a stand, or the one along
+        the schedule of its steps and feet, of which the last is kept.
+        """
+        if task.standing:
+            return self.stage("direct", flip=bool(task.rotation_rad))
+        contacts = Contacts.to(task, self.robot, self.limits.flight_s)
+        if self._stepping is None or self._stepping.contacts != contacts:
+            weights = settled(Weights, None, size=self._size)
+            self._stepping = self._whole_body(None, self.limits, weights, contacts=contacts)
+        return self._stepping
 
     def _joint_changes(self, asked: StageChanges = StageChanges()) -> StageChanges:
         """Changes to stage 2, with the weights that one plan is ``asked`` for."""
@@ -283,6 +297,11 @@ class Planner(Shown):
         """Refuse a target or a start that a method or the robot has no place for, before anything
         is solved.
         """
+        if method != "direct" and not task.standing:
+            raise InputError(
+                f"method {quoted(method)}: its stages plan jumps from a stand, off both feet and "
+                f"onto both; choose 'direct', or leave out takeoff, landing and run_up"
+            )
         if method != "direct" and not task.in_plane:
             raise InputError(
                 f"method {quoted(method)}: stages 1 and 2 are planar, and this target goes to the "
@@ -301,6 +320,8 @@ class Planner(Shown):
             raise InputError(
                 "a flip begins in the stance; leave out start, or set rotation_rad to 0"
             )
+        if not task.standing:
+            return
         limits = self._settings(Limits, bool(task.rotation_rad))
         surface_of_jump(self._model, limits, task)
         if start is None:  # elsewhere the CoM waits elsewhere
@@ -348,10 +369,10 @@ class Planner(Shown):
             raise InputError(
                 f"starts = {starts} must be 1 to {len(COMPARED)}, and 1 if near is given"
             )
-        if starts > 1 and (method != "direct" or task.rotation_rad):
+        if starts > 1 and (method != "direct" or task.rotation_rad or not task.standing):
             raise InputError(
                 f"starts = {starts}: only method 'direct' compares several starts, and only in "
-                f"jumps without rotation; leave out starts"
+                f"jumps from a stand without rotation; leave out starts"
             )
         asked = self.prepared(method, weights, task)
         begin = {"weights": asked[LAST].weights}
@@ -362,7 +383,8 @@ class Planner(Shown):
             begin["near"] = near.whole_body
         if method == "direct":
             body = self._direct(task, begin, starts)
-            return JumpPlan.of(self.robot, method, body)
+            contacts = None if task.standing else body.schedule.contacts
+            return JumpPlan.of(self.robot, method, body, contacts=contacts)
         flip = bool(task.rotation_rad)
         last = self.stage(LAST, flip=flip)
         srmp = self.stage("srmp", flip=flip).plan(
@@ -384,10 +406,10 @@ class Planner(Shown):
         """The whole body alone; an atlas's plan close by first, where there is one."""
         flip = bool(task.rotation_rad)
         alone = not begin["weights"] and "near" not in begin
-        last = self.stage("direct", flip=flip)
+        last = self.direct(task)
         if starts > 1:
             return last.cheapest(task, starts, **begin)
-        if self.atlas is not None and alone and task.in_plane and not flip:
+        if self.atlas is not None and alone and task.in_plane and task.standing and not flip:
             if (body := self.atlas.solve(last, task, begin.get("stance"))) is not None:
                 return body
         return last.plan(task, **begin)
@@ -401,8 +423,8 @@ class Planner(Shown):
 
         Stages 1 and 3 begin with their previous solutions. Stage 2, whose result is only a start
         for stage 3, is left out: the previous whole body is the better one. Where a previous
-        solution leads nowhere, the stage starts anew. A flip is planned anew. ``start`` (5,) as in
-        :meth:`plan`.
+        solution leads nowhere, the stage starts anew. A flip is planned anew, as is a target with
+        other steps or feet. ``start`` (5,) as in :meth:`plan`.
 
         Raises
         ------
@@ -415,8 +437,10 @@ class Planner(Shown):
                 f"({previous.robot.hash}), not for {self.robot.name} ({self.robot.hash}); "
                 f"give a plan of this robot"
             )
-        anew = task.rotation_rad or previous.contacts is not None or previous.whole_body is None
-        near = None if anew else previous
+        body = previous.whole_body
+        phases = [] if body is None else body.schedule.contacts.phases
+        other = phases != self.direct(task).contacts.phases
+        near = None if task.rotation_rad or other else previous
         return self.plan(task, previous.method, start=start, near=near)
 
     @checked

@@ -28,6 +28,7 @@ LONGEST_S = 30.0
 AFTER = 0.1
 THREE_STEPS = ("SRMP", "joint_map")  # where a refusal is none of the method "direct"
 NEAR_RECORD = 0.85  # share of a record, from where on a refusal names it
+STEPS = 2  # of a run-up for a distance that is too far from a stand
 LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
 
 
@@ -129,10 +130,26 @@ def _advice(
         tell(f"refused; trying {tried[-1]}")
         refusal = refused(planner, easier, method)
         if refusal is None:
-            return f"ask for {tried[-1]}, which has a plan"
+            other = _run_up(planner, task, easier) if steps == 1 else ""  # where time is left
+            return f"ask for {tried[-1]}, which has a plan{other}"
     if not tried:
         return "no easier target was tried"
     return f"none of the easier targets that were tried has a plan either: {'; '.join(tried)}"
+
+
+def _run_up(planner: Planner, task: JumpTask, easier: JumpTask) -> str:
+    """The run-up that reaches a distance which is too far from a stand, in words; empty if there is
+    none, or no time for it.
+    """
+    alone = task.standing and task.in_plane and not task.rotation_rad
+    if not alone or not abs(easier.distance_m) < task.distance_m or left_s() <= 0:
+        return ""
+    running = replace(task, takeoff="left", run_up=STEPS)
+    said = f"a run-up of {STEPS} steps (takeoff='left', run_up={STEPS})"
+    tell(f"refused; trying {said}")
+    if refused(planner, running, USUAL) is not None:
+        return ""
+    return f"; or for {said}, which reaches {task.distance_m:g} m"
 
 
 def refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -248,7 +248,7 @@ class Certificate:
             "schema": SCHEMA,
             "passed": self.passed,
             "failures": self.failures,
-            "target": asdict(self.task),
+            "target": self.task.numbers,
             "robot": {"name": self.robot.name, "hash": self.robot.hash},
             "plan": self.plan,
             "seed": self.seed,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -143,7 +142,7 @@ def plan_rows(
                 if len(row) < GIVE_UP or any(x[good] for x in row[-GIVE_UP:])
             ]
             cells = [column[k] for k in alive]
-            now = {key_of(*known, asdict(task)): joblib.delayed(work)(task) for task in cells}
+            now = {key_of(*known, task.numbers): joblib.delayed(work)(task) for task in cells}
             for k, result in zip(alive, study.results(now), strict=True):
                 rows[k].append(result)
     return [pair for both in zip(tasks, rows, strict=True) for pair in zip_longest(*both)]

@@ -202,7 +202,8 @@ def record(
     robot : who jumps, or what :meth:`Robot.load` takes.
     what : the number: "height_m", "distance_m", "platform_m", "side_m" or "yaw_rad".
     given : the rest of the target; by default a jump on the spot (a platform as near as it can be),
-        with the rise that gives most.
+        with the rise that gives most. With steps, or on one foot, only a height or a distance on
+        level ground has a record.
     share : of the record; a jump of this share is played first, a smaller one if the robot falls.
     engines : in which it is played; () plays none.
     terms, weights, off, limits, mesh : as of :class:`jumplab.Planner`.
@@ -217,6 +218,12 @@ def record(
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
     if what not in EASY:
         raise InputError(f"what = {quoted(what)}: a record is one of {', '.join(EASY)}")
+    stepping = given is not None and not given.standing
+    if stepping and (what not in ("height_m", "distance_m") or given.platform_m):
+        raise InputError(
+            f"what = {quoted(what)}: after steps, or on one foot, only height_m and distance_m on "
+            f"level ground have a record; leave out takeoff, landing and run_up"
+        )
     if not 0 < share <= 1:
         raise InputError(f"share = {share:g} must be above 0 and at most 1")
     for engine in engines:
@@ -231,7 +238,9 @@ def record(
         share, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
-    bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
+    bound = math.inf
+    if plan.task.standing:
+        bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
     if given is None and not any(changes.values()):
         keep_record(robot, what, value)
     made = plan, plan.audit, found, ends, share, runs
@@ -244,7 +253,7 @@ class _Search:
 
     def __init__(self, planner: Planner, what: str, given: JumpTask | None):
         self.planner = planner
-        self.stage = planner.stage("direct")
+        self.stage = planner.stage("direct") if given is None else planner.direct(given)
         self.what = what
         self.given = given or _usual(self.stage.body, what)
         names = [name for name, field in SOUGHT.items() if field == what]
@@ -253,17 +262,23 @@ class _Search:
         self.sought = tuple(names)
 
     def program(self, task: JumpTask) -> Program:
-        """The one in which the number is an unknown, on a mesh of which little is left to gain."""
-        return self.stage.seeking(self.stage.program(task), self.sought).finer
+        """The one in which the number is an unknown, on a mesh of which little is left to gain; of
+        steps, which are three times as long, on the usual one.
+        """
+        seeking = self.stage.seeking(self.stage.program(task), self.sought)
+        return seeking.finer if self.given.standing else seeking
 
     def starts(self, best: list[tuple]) -> Iterator[JumpTask]:
-        """Jumps to begin with: easy ones (:data:`EASY`), then shares of the ``best`` one."""
+        """Jumps to begin with: easy ones (:data:`EASY`), then shares of the ``best`` one; after
+        steps, where each takes a minute or more, the middle one of them alone.
+        """
         leg = self.stage.body.leg_m
-        for number, rise in EASY[self.what]:
+        alone = not self.given.standing
+        for number, rise in EASY[self.what][alone : 2 if alone else None]:
             x = number if self.what == "yaw_rad" else number * leg
             more = {"height_m": rise * leg} if "takeoff_speed" in self.sought else {}
             yield replace(self.given, **(more | {self.what: x}))
-        for share in CLIMB if best else ():
+        for share in CLIMB if best and not alone else ():
             yield self.at(max(best, key=lambda x: x[0])[1], share)
 
     def from_easy(self) -> tuple[dict[str, float], Solved]:
@@ -277,7 +292,9 @@ class _Search:
             tell(f"record of {self.planner.robot.name} from {word}")
             found[word] = math.nan
             try:
-                near = self.stage.solved(task)
+                # after steps links meet, and a record begins with their rows
+                begin = self.stage.solved if task.standing else self.stage.plan
+                near = begin(task)
                 program = self.program(task)
                 solved = program.solve_apart(Asked(task, near=near), SEEKING)
             except (InfeasibleError, SolverError) as e:
@@ -300,7 +317,9 @@ class _Search:
         """Refuse a record that a number of the problem ends, not the robot."""
         least, longest = self.stage.limits.flight_s
         who = f"robot {self.planner.robot.name}: the record of {self.what} is limited by"
-        if solved.solution.phases["flight"].duration > (1 - NEAR_END) * longest:
+        contacts = self.stage.contacts
+        flight = contacts.phases[contacts.last_flight].name
+        if solved.solution.phases[flight].duration > (1 - NEAR_END) * longest:
             raise InfeasibleError(
                 f"{who} the flight of {longest:g} s, the longest that plans may have, not by the "
                 f"robot; allow more by limits={{'flight_s': ({least:g}, {2 * longest:g})}}",

@@ -12,7 +12,7 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from itertools import product
 from pathlib import Path
@@ -58,7 +58,7 @@ class Case:
     def key(self, *more: Any) -> str:
         """Key of this case, different for all others; it depends on ``more``, too."""
         weights = dict(self.weights)
-        return key_of(self.method, robot_of(self.robot).hash, weights, asdict(self.task), *more)
+        return key_of(self.method, robot_of(self.robot).hash, weights, self.task.numbers, *more)
 
 
 @checked

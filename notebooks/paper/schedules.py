@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
@@ -14,15 +16,20 @@ from matplotlib.figure import Figure
 from scipy.integrate import trapezoid
 
 import jumplab as jl
+from jumplab import sim
 from jumplab.errors import SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, by_phase, new_figure
 from jumplab.stages.plan import JumpPlan, planned
+from jumplab.studies import trials
 from paper import logs
 
 LOG = Path(__file__).with_name("schedules.jsonl")
+LONGEST = Path(__file__).with_name("run_up_records.jsonl")
+PERTURBED = Path(__file__).with_name("schedules_perturbed.jsonl")
 ROBOTS = "bhr", "g1_arms"
+RISE_M = 0.1  # of the jumps whose distance is a record
 PATIENCE_S = 40.0  # processor time for one plan
 # name -> words of Contacts.named
 CASES = {
@@ -83,6 +90,40 @@ def _row(folder: Path, robot: str, case: str) -> dict[str, Any]:
     return row
 
 
+def perturbed(folder: str | Path, n: int = 30, path: Path = PERTURBED, robots: Iterable[str] = ROBOTS) -> None:
+    """Let ``n`` perturbed robots play each plan that :func:`study` kept in ``folder``, in each engine; one row each.
+
+    Trials of a plan are kept beside it: an interrupted run, or one of more robots, goes on where the other ended.
+    ``python -m paper.schedules DIR N`` calls it.
+    """
+    with logs.keep(path, itemgetter("robot", "case", "engine", "n")) as log:
+        for robot, case, engine in product(robots, CASES, sim.INSTALLED):
+            place = Path(folder) / f"{robot} {case}"
+            if (robot, case, engine, n) in log.done or not (place / "plan.npz").is_file():
+                continue
+            settings = trials.TrialSettings(engine=engine)
+            report = trials.run_trials(place, n, settings=settings, jobs=1, progress=False)
+            row = {"robot": robot, "case": case, "engine": engine, "n": n, "landed": report.landed}
+            log.add(row | {"causes": report.causes})
+
+
+def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = ROBOTS) -> None:
+    """The longest standing jump with a rise of :data:`RISE_M`, and the longest flight with it off one foot after a
+    run-up of two steps; one row each, plans kept in ``folder``. ``python -m paper.schedules DIR records`` calls it.
+    """
+    stand = jl.JumpTask(0.0, RISE_M)
+    asked = {"stand": stand, "run-up": replace(stand, takeoff="left", run_up=2)}
+    with logs.keep(path, itemgetter("robot", "from")) as log:
+        for robot, name in product(robots, asked):
+            if (robot, name) in log.done:
+                continue
+            began = time.process_time()
+            found = jl.record(robot, "distance_m", asked[name], engines=())
+            jl.save(Path(folder) / f"{robot} record {name}", found.plan)
+            row = {"robot": robot, "from": name, "distance_m": found.value, "at_nodes_m": found.best}
+            log.add(row | {"cpu_s": round(time.process_time() - began, 1), "line": found.line()})
+
+
 def _planned(folder: Path, robot: str, words: str) -> JumpPlan:
     if (folder / "plan.npz").is_file():
         return jl.load(folder).plan
@@ -139,4 +180,9 @@ def speeds(plans: dict[str, JumpPlan]) -> Figure:
 
 
 if __name__ == "__main__":
-    study(*sys.argv[1:2])
+    if sys.argv[2:] == ["records"]:
+        records(sys.argv[1])
+    elif sys.argv[2:]:
+        perturbed(sys.argv[1], int(sys.argv[2]))
+    else:
+        study(*sys.argv[1:2])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.legs import size
+from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.ground import Surface
 from jumplab.stages.whole_body.tape import FLAT, SHORTEST_S, feet_of
 from jumplab.stages.whole_body.terms import SOLE_SHARES
@@ -22,15 +24,19 @@ PRESSED_N = 50.0  # on a foot, from which on its CoP is looked at
 CLEAR_M = 0.02  # of the soles over the ground in mid-flight
 MIDDLE = (0.3, 0.7)  # the shares of a flight between which that is
 SUNK_M = 1e-3  # of a sole in the ground or in a platform
+EDGE_M = 0.01  # of a shank from an edge
+EVERY = 4  # of so many samples one is looked at for it
 
 
-def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> float:
+def used_between(
+    tape: Tape, robot: Robot, surface: Surface = Surface(), body: Body | None = None
+) -> float:
     """Largest share [1] that the tape uses of the limits of motors, stops, ground, and of gaps
     between angles, rates and accelerations.
 
     The limits are those of the audit; up to 1 the tape holds them, also between the nodes. Soles
     that in the middle of a flight are as low as they may be use all of their height, on the surface
-    twice of it.
+    twice of it; so do shanks of the ``body`` at an edge.
     """
     motors = robot.limits
     of = size(robot).of
@@ -48,6 +54,7 @@ def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> floa
         _gap(tape.t, angles, rates) / of(RATE_GAP, "rad/s"),
         _gap(tape.t, rates, tape.a[:, 6:]) / of(ACCELERATION_GAP, "rad/s^2"),
         _low(tape, robot, surface, origin, turn),
+        *([] if body is None or not surface.height_m else [_at_edge(tape, body, surface)]),
     ]
     return float(max(x.max() for x in shares))
 
@@ -83,7 +90,8 @@ def _pressed_outside(tape: Tape, robot: Robot, turn: np.ndarray) -> np.ndarray:
 def _low(
     tape: Tape, robot: Robot, surface: Surface, origin: np.ndarray, turn: np.ndarray
 ) -> np.ndarray:
-    """Share (n, 2) of what the soles may be too low in flight, in its middle under :data:`CLEAR_M`.
+    """Share (n, 2) of what soles in the air may be too low, in the middle of a flight under
+    :data:`CLEAR_M`.
 
     ``origin`` (n, 2, 3) [m] and ``turn`` (n, 2, 3, 3) are places and attitudes of the feet.
     """
@@ -92,9 +100,26 @@ def _low(
     sole = np.concatenate([heels + share * (toes - heels) for share in SOLE_SHARES])
     points = origin[:, :, None] + np.einsum("nkij,pj->nkpi", turn, sole)
     height = (points[..., 2] - surface.below(points)).min(axis=2)
-    shares = np.full(height.shape, -np.inf)
+    shares = np.where(tape.contacts > 0, -np.inf, -height / SUNK_M)
     for rows in tape.flights:
         t = tape.t[rows] - tape.t[rows.start]
         middle = (t >= MIDDLE[0] * t[-1]) & (t <= MIDDLE[1] * t[-1])
         shares[rows] = np.where(middle[:, None], 2 - height[rows] / clear, -height[rows] / SUNK_M)
     return shares
+
+
+def _at_edge(tape: Tape, body: Body, surface: Surface) -> np.ndarray:
+    """Share (n, points) of what the shanks may be near the edge where the ground steps."""
+    tree = body.robot.model
+    data = tree.createData()
+    least = size(body.robot).of(EDGE_M, "m")
+    top = max(surface.height_m, 0.0)
+    places = []
+    for q in tape.q[::EVERY]:
+        pin.forwardKinematics(tree, data, q)
+        places.append([data.oMi[1 + k].act(place) for k, place in body.shank_points])
+    points = np.array(places)
+    before = points[..., :2] @ surface.along - surface.edge_m  # of the block's side
+    before *= -np.sign(surface.height_m)
+    away = np.hypot(np.maximum(before, 0.0), np.maximum(points[..., 2] - top, 0.0))
+    return 2 - (away - body.shank_m) / least

@@ -7,12 +7,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError, quoted
 from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
 from jumplab.stages.whole_body.settings import Limits, Mesh
+from jumplab.task import MOST_STEPS, JumpTask
 
 SIDES = ("left", "right")
 HOLD = ("x", "y", "z", "yaw")  # of the middle of the toe edge of a foot that carries
@@ -26,8 +28,11 @@ TIMES = {
     FLIGHT: (0.5, 1.5, 0.8),
 }
 INTERVALS = {"two feet": 12, "one foot": 12, "toes": 6, FLIGHT: 12}
-MOST = 30  # steps or jumps in a row; a program of more is too large to solve
 STEP_SHARE = 0.33  # of the leg: a step or hop of usual length
+LONGER = (
+    0.9  # of a step of usual length, by which the feet of a run-up come down ahead of each other
+)
+FREE_SHARE = 0.5  # of it, by which those before a target may be longer or shorter
 
 
 def modes_of(feet: str) -> dict[int, str]:
@@ -115,6 +120,8 @@ class Contacts:
     ends : "rest" (the robot stands still) or "touchdown" (in flight, both flat soles about to meet
         the ground).
     first : places of the first contacts, left before right; those of the stance if empty.
+    aimed : whether the last flight has the rise of the target, and covers its distance; its places
+        count from there, not from where a foot stood first.
 
     Raises
     ------
@@ -126,6 +133,7 @@ class Contacts:
     places: tuple[Place, ...] = ()
     ends: str = "rest"
     first: tuple[Place, ...] = ()
+    aimed: bool = False
     # (phase, side) of each contact, the first ones included
     landings: tuple[tuple[int, int], ...] = field(init=False)
 
@@ -210,13 +218,26 @@ class Contacts:
         heights = [p.up_m for p in self.places]
         height = heights[-1] if heights else 0.0
         first = next((i for i, up in enumerate(heights) if up == height), len(heights))
-        if any(heights[:first]) or set(heights[first:]) - {height}:
+        wrong = [i for i, up in enumerate(heights) if up != (height if i >= first else 0.0)]
+        if wrong:
             listed = ", ".join(f"{up:g}" for up in heights)
+            phase, side = self.landings[len(self.phases[0].modes) + wrong[0]]
             raise InputError(
-                f"places at the heights {listed} m: the ground can have only one step up or down; "
-                f"give all places after the step the same up_m, and all before it none"
+                f"phase {self.phases[phase].name!r}: the {SIDES[side]} foot comes down "
+                f"{heights[wrong[0]]:g} m high, in places at the heights {listed} m; the ground "
+                f"can have only one step up or down: give all places after it the same up_m, and "
+                f"all before it none"
             )
         return height, first
+
+    @property
+    def last_flight(self) -> int:
+        """Number of the last phase in flight; -1 if there is none."""
+        return max((k for k, p in enumerate(self.phases) if p.flying), default=-1)
+
+    def is_aimed(self, contact: int) -> bool:
+        """Whether a contact, by its index into :attr:`landings`, is one that the target places."""
+        return self.aimed and self.landings[contact][0] > self.last_flight
 
     def eased(self, share: float) -> Contacts:
         """The same with less to do: a ``share`` [1] of its step up or down or, on level ground, of
@@ -229,6 +250,27 @@ class Contacts:
     def contact_of(self, phase: int, side: int) -> int:
         """Index into :attr:`landings` of the contact of a foot (0 left, 1 right) in a phase."""
         return max(i for i, (k, s) in enumerate(self.landings) if k <= phase and s == side)
+
+    @classmethod
+    @checked
+    def to(cls, task: JumpTask, robot: Robot, flight_s: tuple[float, float]) -> Contacts:
+        """The schedule of a target that asks for steps, or for a take-off or a landing on one foot;
+        ``flight_s`` bounds the last flight [s].
+
+        The steps may be longer or shorter, but for those towards an edge, and those to a take-off
+        off both feet, which stand side by side.
+        """
+        words = _course(task.takeoff, task.run_up, task.landing)
+        flight = words.index(FLIGHT)
+        d = _step(robot, None)
+        free = FREE_SHARE * d * (task.takeoff != "both" and not task.platform_m)
+        ahead = [d * (1 + LONGER * k) for k in range(task.run_up)]
+        ahead += ahead[-1:] * (task.takeoff == "both")
+        steps = [replace(Place(x), free_m=(free, Place(x).free_m[1])) for x in ahead]
+        landed = Place(0.0, task.side_m)
+        phases = [ContactPhase.usual(feet, robot) for feet in words]
+        phases[flight] = replace(phases[flight], time_s=flight_s)
+        return cls(tuple(phases), (*steps, landed, landed), aimed=True)
 
     @classmethod
     @checked
@@ -272,19 +314,16 @@ class Contacts:
         if foot not in SIDES:
             raise InputError(f"foot = {quoted(foot)}: choose {' or '.join(SIDES)}")
         place = Place(_step(robot, ahead_m))
-        up = "LR"[SIDES.index(foot)]
-        return cls.of(f"LR {up} {up.lower()} - {f'{up} ' * same}LR", robot, [place, place])
+        words = _course(foot, 0, foot if same else "both")
+        return cls.of(" ".join(words), robot, [place, place])
 
     @classmethod
     def run_up(cls, robot: Robot, steps: int = 1, step_m: float | None = None) -> Contacts:
         """``steps`` (0 to 30) of ``step_m`` [m], then off one foot, and down on both."""
         _check_count("steps", steps, 0)
         d = _step(robot, step_m)
-        words = ["LR", "L"]
-        ahead = [d * (1 + 0.9 * k) for k in range(steps)]
-        for k in range(steps):
-            words += ["Lr", "L"] if k % 2 else ["lR", "R"]
-        words += [words[-1].lower(), FLIGHT, "LR"]
+        words = _course(SIDES[steps % 2], steps, "both")
+        ahead = [d * (1 + LONGER * k) for k in range(steps)]
         jump = (ahead or [0.0])[-1] + 1.6 * d
         return cls.of(" ".join(words), robot, [Place(x) for x in (*ahead, jump, jump)])
 
@@ -294,7 +333,8 @@ class Contacts:
         following; ``share`` is how many steps ahead they land.
         """
         d = _step(robot, step_m)
-        return cls.of("LR L lR R r - L LR", robot, [Place(d), Place(share * d), Place(share * d)])
+        words = _course("right", 1, "left")
+        return cls.of(" ".join(words), robot, [Place(d), Place(share * d), Place(share * d)])
 
     @classmethod
     def hurdle(cls, robot: Robot, step_m: float | None = None) -> Contacts:
@@ -313,7 +353,7 @@ class Contacts:
     def step_off(cls, robot: Robot, drop_m: float, ahead_m: float | None = None) -> Contacts:
         """Off an edge with one foot first, in flight, and down on both, ``drop_m`` [m] lower."""
         low = Place(_off(robot, ahead_m), up_m=-drop_m)
-        return cls.of("LR L l - LR", robot, [low, low])
+        return cls.of(" ".join(_course("left", 0, "both")), robot, [low, low])
 
     @classmethod
     def drop_jump(
@@ -349,13 +389,36 @@ def jump_contacts(limits: Limits, mesh: Mesh) -> Contacts:
     return Contacts(phases, ends="touchdown")
 
 
+def _course(takeoff: str, steps: int, landing: str) -> list[str]:
+    """Words of ``steps`` from a stand, one foot after the other, a take-off and a landing, each on
+    the feet of such words as of :class:`.JumpTask`.
+    """
+    last = SIDES.index(takeoff) if takeoff in SIDES else 0
+    words = ["LR"]
+    sides = [
+        (last + steps - k) % 2 for k in range(steps + 1)
+    ]  # the one that stands, then the steps
+    if steps or takeoff in SIDES:
+        words.append("LR"[sides[0]])
+    for before, side in pairwise(sides):
+        words += [("lR", "Lr")[before], "LR"[side]]
+    if takeoff in SIDES:
+        words.append("lr"[last])
+    else:
+        words += ["LR", "lr"] if steps else ["lr"]
+    words.append(FLIGHT)
+    if landing in SIDES:
+        words.append("LR"[SIDES.index(landing)])
+    return [*words, "LR"]
+
+
 def _step(robot: Robot, given_m: float | None) -> float:
     return STEP_SHARE * leg_length(robot) if given_m is None else given_m
 
 
 def _check_count(name: str, count: int, least: int) -> None:
-    if not least <= count <= MOST:
-        raise InputError(f"{name} = {quoted(count)} is outside {least} ... {MOST}")
+    if not least <= count <= MOST_STEPS:
+        raise InputError(f"{name} = {quoted(count)} is outside {least} ... {MOST_STEPS}")
 
 
 def _off(robot: Robot, given_m: float | None) -> float:

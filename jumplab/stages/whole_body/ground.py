@@ -95,26 +95,39 @@ def surface_of_jump(body: Body, limits: Limits, task: JumpTask) -> Surface:
     return Surface.between(leaving, arriving, task.platform_m, limits, task.along_rad)
 
 
-def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts) -> Surface:
-    """The ground of a schedule, between its places on either height [m].
+def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: JumpTask) -> Surface:
+    """The ground of a schedule, between its places on either height, or of the target that it is
+    for [m].
 
-    Raises :class:`InfeasibleError` if no edge fits between them.
+    Raises :class:`InfeasibleError` if no edge fits between them; the sentence names the phase.
     """
     height, first = contacts.surface
+    before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
+    after = [p.ahead_m for p in contacts.places[first:]]
+    if contacts.aimed:
+        height = task.platform_m
+        stood = len(contacts.first)
+        aimed = [contacts.is_aimed(stood + i) for i in range(len(contacts.places))]
+        first = aimed.index(True)
+        before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
+        after = [before[-1] + task.distance_m]
     if height == 0:
         return Surface()
     length = 2 * body.half_m
     toes = float(body.places[:, 0].mean())
-    leaving = max([toes, *(toes + p.ahead_m for p in contacts.places[:first])])
-    arriving = min(toes + p.ahead_m for p in contacts.places[first:]) - length
+    leaving = toes + max(before)
+    arriving = toes + min(after) - length
     room = 2 * limits.edge_before_heel_m
     if arriving - leaving < room:
-        bound = leaving + room + length - toes
+        phase, _ = contacts.landings[len(contacts.first) + first]
+        number = "distance_m" if contacts.aimed else "ahead_m"
+        from_here = before[-1] if contacts.aimed else 0.0
+        bound = float(np.ceil(100 * (max(before) + room + length - from_here) - 1e-6) / 100)
         raise InfeasibleError(
-            f"places on a surface {height:g} m higher: it would begin {arriving - leaving:.2f} m "
-            f"ahead of the toes that take off, must be at least {room:.2f} m; put the places "
-            f"{bound:.2f} m ahead",
-            number="ahead_m",
+            f"phase {contacts.phases[phase].name!r}: feet come down on a surface {height:g} m "
+            f"higher that would begin {arriving - leaving:.2f} m ahead of the toes before it, must "
+            f"be at least {room:.2f} m; make {number} at least {bound:.2f} m",
+            number=number,
             bound=bound,
         )
     return Surface.between(leaving, arriving, height, limits)

@@ -86,8 +86,8 @@ def along(schedule: Schedule, task: JumpTask, crouch: float = CROUCH, arms: floa
     contacts = schedule.contacts
     body = schedule.body
     durations = np.array([p.guess_s for p in contacts.phases])
-    if contacts.ends == "touchdown":
-        durations[-1] = _flight_s(task, body.leg_m)
+    if contacts.aimed or contacts.ends == "touchdown":
+        durations[contacts.last_flight] = _flight_s(task, body.leg_m)
     motion = Motion(durations, [])
     curves = _curves(schedule, task, motion.starts, crouch, arms)
     reach = Reach(body, schedule.limits.range_margin_rad)
@@ -292,6 +292,9 @@ def footholds(schedule: Schedule, task: JumpTask) -> list[dict[int, np.ndarray]]
         {side: np.mean(schedule.foothold(contacts.contact_of(k, side)), axis=1) for side in p.modes}
         for k, p in enumerate(contacts.phases)
     ]
+    for k in range(contacts.last_flight + 1, len(holds) * contacts.aimed):
+        for hold in holds[k].values():
+            hold += [task.distance_m + _left_ahead(schedule, holds), 0.0, task.platform_m, 0.0]
     if contacts.ends == "rest":
         return [*holds, holds[-1]]
     turn = pin.rpy.rpyToMatrix(0.0, 0.0, task.yaw_rad)
@@ -299,6 +302,12 @@ def footholds(schedule: Schedule, task: JumpTask) -> list[dict[int, np.ndarray]]
     way = np.array([task.distance_m, task.side_m, task.platform_m])
     places = centre + way + (body.places - centre) @ turn.T
     return [*holds, {side: np.append(x, task.yaw_rad) for side, x in enumerate(places)}]
+
+
+def _left_ahead(schedule: Schedule, holds: Sequence[Mapping[int, np.ndarray]]) -> float:
+    """By how much the feet that leave last are ahead of where they stood first [m]."""
+    left = holds[schedule.contacts.last_flight - 1]
+    return float(np.mean([x[0] - schedule.body.places[side, 0] for side, x in left.items()]))
 
 
 class Feet:
@@ -354,11 +363,12 @@ def _placed(hold: np.ndarray, pitch: float) -> pin.SE3:
 
 # values at the nodes
 # ----------------------------------------------------------------------------------------------
-def guess(schedule: Schedule, motion: Motion) -> dict[str, PhaseGuess]:
+def guess(schedule: Schedule, task: JumpTask, motion: Motion) -> dict[str, PhaseGuess]:
     """Phase name -> start values (N + 1, .) of a motion: rates by differences, even forces [N], no
     torques.
     """
     body = schedule.body
+    holds = footholds(schedule, task)
     starts = motion.starts
     times = [np.linspace(*starts[k : k + 2], len(q)) for k, q in enumerate(motion.charts)]
     t, once = np.unique(np.concatenate(times).round(9), return_index=True)
@@ -376,9 +386,8 @@ def guess(schedule: Schedule, motion: Motion) -> dict[str, PhaseGuess]:
         constants = {}
         for side in b.sides:
             z[:, : b.n_forces] = body.mg * len(b.sides) / len(b.modes) / b.n_forces
-            hold = schedule.foothold(schedule.contacts.contact_of(k, side))
             names = [f"{SIDES[side]}_{x}" for x in HOLD]
-            constants |= dict(zip(names, np.mean(hold, axis=1), strict=True))
+            constants |= dict(zip(names, holds[k][side], strict=True))
         if b.flying:
             flown = _parabola(body, q[rows[[0, -1]]], motion.durations[k])
             constants |= {name: flown[name] for name in b.constants}

@@ -64,7 +64,7 @@ class WholeBodyPlan(Shown):
             program.limits,
             tape,
             max(
-                used_between(tape, robot, surface),
+                used_between(tape, robot, surface, program.body),
                 used_apart(program.body, solved.schedule.apart, list(phases.values()), tape),
             ),
             start,

@@ -30,19 +30,18 @@ from jumplab.stages.whole_body.problem import NAME
 from jumplab.stages.whole_body.program import Program, Solved
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.starts import (
+    ALONG,
     ASIDE,
     COLD,
     COMPARED,
     FROM_NEIGHBOUR,
     GIVEN,
     IN_PLANE,
-    LONG_SCHEDULE,
     MENDED,
     NEIGHBOUR,
     REFINED,
+    REFINED_ALONG,
     SETTLED,
-    SHORT,
-    SHORT_SCHEDULE,
     STANCE,
     Asked,
     Attempt,
@@ -275,7 +274,7 @@ class WholeBodyPlanner:
         ramp = aside and not turns and asked.straight is not None
         cold = IN_PLANE if program.free.plane else ASIDE if ramp else COLD
         if self.contacts.ends == "rest":
-            cold = SHORT_SCHEDULE if len(self.contacts.phases) <= SHORT else LONG_SCHEDULE
+            cold = ALONG
         near = FROM_NEIGHBOUR if asked.near is not None else ()
         given = GIVEN if asked.motion is not None else ()
         if task.rotation_rad:  # a body that turns over has no places for its feet
@@ -292,12 +291,14 @@ class WholeBodyPlanner:
         """
         solved = program.solve_apart(asked, start)
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
+        along = self.contacts.ends == "rest" and not program.follows
         # what is followed is settled
-        for further in REFINED[program.follows :]:
-            late = further is not SETTLED and asked.spent_s > program.left_s(asked)
+        for further in REFINED_ALONG if along else REFINED[program.follows :]:
+            settles = further.name == SETTLED.name
+            late = not settles and asked.spent_s > program.left_s(asked)
             if best.used <= 1 or (late and best.used > HOPELESS) or program.spent(asked):
                 break
-            program = program if further is SETTLED else program.finer
+            program = program if settles else program.finer
             try:
                 solved = program.solve_apart(replace(asked, near=solved), further)
             except SolverError:

@@ -23,6 +23,7 @@ from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
 from jumplab.stages.whole_body.terms import (
     body_clearance,
+    distance_flown,
     dynamics,
     flight_rows,
     foot_rows,
@@ -33,6 +34,7 @@ from jumplab.stages.whole_body.terms import (
     motor_lines,
     opening_rows,
     reserve,
+    rise,
     sides_apart,
     smoothness,
     swing_rows,
@@ -134,7 +136,8 @@ class Schedule:
         phases = tuple(self._phase(k) for k in range(len(self.contacts.phases)))
         parameters = {"stance": self.modes[0].nv, **PARAMETERS}
         if not self.tracking:
-            return Problem(NAME, phases, (), parameters)
+            joining = (self._distance(),) if self.contacts.aimed else ()
+            return Problem(NAME, phases, joining, parameters)
 
         def longer(ends):
             launch = ca.vertcat(ends["flat"].end.duration, ends["toe"].end.duration)
@@ -144,6 +147,13 @@ class Schedule:
         joining = Term(*words, longer, self.weights.track_duration)
         parameters |= {"momentum": 1, "launch_s": 2}
         return Problem(NAME, phases, (joining,), parameters)
+
+    def _distance(self) -> Term:
+        """The distance of the target, from the feet that leave last to those that land."""
+        flight = self.contacts.last_flight
+        left = [(flight - 1, side) for side in self.modes[flight - 1].sides]
+        landed = [(k, x) for k in range(flight + 1, len(self.modes)) for x in self.landed(k)]
+        return distance_flown(self.body, [p.name for p in self.contacts.phases], left, landed)
 
     def _terms(self, k: int) -> list[Term]:
         """Terms of a phase, from those that every phase has to those of its end."""
@@ -176,6 +186,8 @@ class Schedule:
             terms += flight_rows(m)
         if last and self.contacts.ends == "touchdown":
             terms += touchdown_rows(m)
+        if self.contacts.aimed and k == self.contacts.last_flight:
+            terms.append(rise())
         met = [x for x in self.apart if x.phase == k]
         terms += [link_distance(m, x, phases[k].intervals) for x in met]
         if self.sought and m.raised:
@@ -223,7 +235,11 @@ class Schedule:
             out = {name: FLIGHT_BOXES[name.partition("_")[0]] for name in mode.constants}
         for side in mode.sides:
             contact = self.contacts.contact_of(k, side)
-            for x, (low, high) in zip(HOLD, self.foothold(contact), strict=True):
+            hold = dict(zip(HOLD, self.foothold(contact), strict=True))
+            if self.contacts.is_aimed(contact):
+                height = partial(_landing_height, hold["z"][0])
+                hold |= {"x": FLIGHT_BOXES["com"][:2], "z": (height, height)}
+            for x, (low, high) in hold.items():
                 out[f"{SIDES[side]}_{x}"] = (low, high, 1.0, f"contact {contact} {x}")
         for name in self.sought:
             ends = (partial(_furthest, name, end) for end in RANGES[SOUGHT[name]][1:])
@@ -231,7 +247,9 @@ class Schedule:
         return out
 
     def foothold(self, contact: int) -> list[tuple[float, float]]:
-        """Bounds of x, y, z [m] and yaw [rad] of the middle of the toe edge in one contact."""
+        """Bounds of x, y, z [m] and yaw [rad] of the middle of the toe edge in one contact; of one
+        that the target places as for a target on the spot.
+        """
         _, side = self.contacts.landings[contact]
         first = self.body.places[side]
         p = (*self.contacts.first, *self.contacts.places)[contact]
@@ -323,6 +341,11 @@ class Schedule:
 
 def _stance(parameters):
     return parameters["stance"]
+
+
+def _landing_height(level: float, parameters: Mapping) -> float:
+    """Height of a toe edge on the landing surface, which on the first one is at ``level`` [m]."""
+    return level + parameters["platform"]
 
 
 def _furthest(name: str, end: float, parameters: Mapping) -> float:

@@ -34,6 +34,7 @@ from jumplab.stages.whole_body.shapes import Apart
 from jumplab.stages.whole_body.starts import (
     AFTER_ROUGH,
     APART,
+    HELD_AFTER_ROUGH,
     STILL,
     Asked,
     Beginning,
@@ -236,7 +237,8 @@ class Program(Shown):
                 break
             more = any(x.more_m > MORE_M for x in rows if x not in begin.apart)
             begin = replace(begin, apart=rows)
-            again = AFTER_ROUGH[min(number, 1)] if start.rough else APART[not held]
+            after_rough = HELD_AFTER_ROUGH if start.held else AFTER_ROUGH
+            again = after_rough[min(number, 1)] if start.rough else APART[not held]
             ways = [(again, begin), (APART[-1], begin)][: 1 + held]
             if not still:  # where more distance does not help, they may not pass each other
                 ways.insert(0 if more else len(ways), (STILL, unpassed(self, asked, rows)))
@@ -311,7 +313,7 @@ class Program(Shown):
         Raises :class:`InfeasibleError` if a sole would stand across its edge.
         """
         if self.contacts.ends == "rest":
-            return surface_of_schedule(self.body, self.limits, self.contacts)
+            return surface_of_schedule(self.body, self.limits, self.contacts, task)
         return surface_of_jump(self.body, self.limits, task)
 
     def parameters(

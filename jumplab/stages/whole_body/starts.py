@@ -130,24 +130,24 @@ class Start:
 def from_schedule(program: Program, asked: Asked, **drawn: float) -> Beginning:
     """A motion ``drawn`` along the schedule (see :func:`.along`)."""
     schedule = program.schedule()
-    return Beginning(guess(schedule, reached(schedule, asked.task, **drawn)))
+    return Beginning(guess(schedule, asked.task, reached(schedule, asked.task, **drawn)))
 
 
 def from_stance(program: Program, asked: Asked) -> Beginning:
     """The stance, carried along the schedule (see :func:`.still`)."""
     schedule = program.schedule()
-    return Beginning(guess(schedule, still(schedule, asked.task)))
+    return Beginning(guess(schedule, asked.task, still(schedule, asked.task)))
 
 
 def from_motion(program: Program, asked: Asked) -> Beginning:
     """The motion that is given (``asked.motion``)."""
-    return Beginning(guess(program.schedule(), asked.motion))
+    return Beginning(guess(program.schedule(), asked.task, asked.motion))
 
 
 def from_mended(program: Program, asked: Asked) -> Beginning:
     """The same with its feet in their places (see :func:`.mended`)."""
     schedule = program.schedule()
-    return Beginning(guess(schedule, mended(schedule, asked.task, asked.motion)))
+    return Beginning(guess(schedule, asked.task, mended(schedule, asked.task, asked.motion)))
 
 
 def from_neighbour(program: Program, asked: Asked) -> Beginning:
@@ -161,7 +161,7 @@ def from_neighbour(program: Program, asked: Asked) -> Beginning:
     meshes = zip(near.phases.values(), program.contacts.phases, strict=True)
     charts = [x.guess(phase.intervals).q[:, :size] for x, phase in meshes]
     durations = np.array([x.duration for x in near.phases.values()])
-    return Beginning(guess(program.schedule(), Motion(durations, charts)))
+    return Beginning(guess(program.schedule(), asked.task, Motion(durations, charts)))
 
 
 def from_straight(program: Program, asked: Asked) -> Beginning:
@@ -177,10 +177,18 @@ def from_straight(program: Program, asked: Asked) -> Beginning:
 
 
 def from_eased(program: Program, asked: Asked) -> Beginning:
-    """The schedule with less to do (see :meth:`.Contacts.eased`), then with ever more."""
-    start = COLD[0]
+    """The schedule, or the target that it has, with less to do (see :meth:`.Contacts.eased`), then
+    with ever more.
+    """
+    start = DRAWN
+    task = asked.task
     for share in EASED:
-        easy = replace(program, contacts=program.contacts.eased(share))
+        easy = program
+        if program.contacts.aimed:
+            less = {x: share * getattr(task, x) for x in ("distance_m", "platform_m")}
+            asked = replace(asked, task=replace(task, **less))
+        else:
+            easy = replace(program, contacts=program.contacts.eased(share))
         named = replace(start, name=f"{100 * share:.0f} % of the schedule")
         solved = easy.solve_apart(asked, named)
         asked = replace(asked, near=solved)
@@ -242,12 +250,6 @@ COMPARED = (
 # where the cost is within 0.1 % of its least lets it take whole steps to the end
 RAMPED = QUICK | {"mu_init": 1e-2, "mu_min": 1e-4}
 ASIDE = (Start("ramp", from_straight, True, 150, RAMPED), *COLD)
-# shares of a schedule, solved one after the other, each from the one before
-EASED = 1 / 3, 2 / 3
-LESS = Start("eased schedule", from_eased, True, 100, NEAR)
-SHORT = 5  # phases, up to which three solves take less time than one that wanders
-SHORT_SCHEDULE = (LESS, *COLD)
-LONG_SCHEDULE = (replace(COLD[0], patience=100), LESS, *COLD[1:])
 # in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is
 # tried soon
 IN_PLANE = (replace(COLD[0], patience=50), *COLD[1:])
@@ -264,6 +266,13 @@ ROUGH = {
     "acceptable_compl_inf_tol": 0.3,
     "acceptable_obj_change_tol": 3e-2,
 }
+# of a schedule, whose feet are in place and whose links meet long before its cost has settled
+DRAWN = replace(COLD[0], patience=100, options=QUICK | ROUGH)
+# shares of a schedule, solved one after the other, each from the one before
+EASED = 1 / 3, 2 / 3
+LESS = Start("eased schedule", from_eased, True, 100, NEAR)
+# one that leads somewhere has done so after 40 steps
+ALONG = (replace(DRAWN, patience=50), LESS, *COLD[1:])
 FOLLOWED = (Start("given motion", from_motion, False, 120, QUICK | ROUGH),)
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, from_neighbour, True, 100, NEAR),
@@ -276,7 +285,11 @@ APART = (
     Start("links apart", from_neighbour, False, 120, MET),
 )
 STILL = replace(COLD[-1], name="links apart as before")
-# from a rough solution, further inside the limits with a higher barrier; then from what came of it
+# from a rough solution with the held Hessian
+HELD_AFTER_ROUGH = tuple(
+    Start("links apart", from_neighbour, True, 100, NEAR | {"mu_init": mu}) for mu in (1e-3, 3e-4)
+)
+# with the exact one, further inside the limits with a higher barrier; then from what came of it
 STEPPED = MET | {"mu_strategy": "monotone"}
 AFTER_ROUGH = tuple(
     Start("links apart", from_neighbour, False, 120, STEPPED | warm(push) | {"mu_init": mu})
@@ -289,4 +302,8 @@ SEEKING = Start("easy jump", from_neighbour, False, 300, WARM | EXACT | FAR_OFF)
 RECORD = Start("record", from_neighbour, False, 150, WARM | EXACT | {"mu_init": 1e-4})
 SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
 FINER = Start("finer mesh", from_neighbour, False, 150, WARM | {"acceptable_iter": 1})
+# of schedules, in half of the time of the exact Hessian
+CLOSER = {"mu_init": 1e-4, "acceptable_iter": 5, "acceptable_obj_change_tol": 5e-4}
+HELD_SETTLED = replace(SETTLED, held=True, patience=60, options=NEAR | CLOSER)
+REFINED_ALONG = (HELD_SETTLED, SETTLED, FINER, FINER)
 REFINED = (SETTLED, FINER, FINER, FINER)  # the last one for flips of robots with a waist

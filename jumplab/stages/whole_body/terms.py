@@ -12,6 +12,7 @@ import numpy as np
 from jumplab.models.spatial import SpatialState, cross
 from jumplab.ocp.problem import Term, limit
 from jumplab.robot.reduction import mirror
+from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES
 from jumplab.stages.whole_body.coordinates import BASE
 from jumplab.stages.whole_body.instant import Instant
@@ -40,6 +41,8 @@ FAR = 100.0  # [m, m/s, rad] beyond any of it, so that its cost is nearly a stra
 # of one of these units of it, in units of the effort: with more of it, motions leave the physics
 # between the nodes
 WORTH = 1000.0
+
+Contact = tuple[int, int]  # number of its phase, side
 
 CLEAR = {"scale": PLACE_SCALE, "group": "clearance"}
 
@@ -129,8 +132,8 @@ def motor_lines(m: Mode, skip: tuple[int, int]) -> Term:
 
 
 def body_clearance(m: Mode) -> Term:
-    """Knees and hands stay away from the ground, and shanks from a platform that they are to be
-    brought onto.
+    """Knees and hands stay away from the ground, and shanks from an edge that they go onto, or
+    over.
     """
     body = m.body
     lim = m.limits
@@ -141,14 +144,22 @@ def body_clearance(m: Mode) -> Term:
     shanks = [spot for spot in body.shank_points if spot[0] in counted]
     face = body.shank_m + lim.shank_clearance_m
 
+    def beside(p, x, step, drop):
+        """Height that a shank needs beyond an edge up, and about an edge down: behind it, the
+        feet keep it up.
+        """
+        near = p.over_edge(x, face)
+        return step * near + drop * (near - p.over_edge(x, -face))
+
     def heights(p):
         lowest = ca.fmin(p.p.platform, 0)
         step = (p.p.platform > 0) * (p.p.platform + face)
+        drop = (p.p.platform < 0) * (face - p.p.platform)
         points = [p.tree.point(*spot) for spot, _ in limbs]
         faces = [p.tree.point(*spot) for spot in shanks]
         return ca.vertcat(
             *(x[2] - p.ground(x, lim.edge_clearance_m) for x in points),
-            *(x[2] - lowest - step * p.over_edge(x, face) for x in faces),
+            *(x[2] - lowest - beside(p, x, step, drop) for x in faces),
         )
 
     least = np.array([least for _, least in limbs] + [0.0] * len(shanks))
@@ -399,6 +410,37 @@ def opening_rows(m: Mode) -> list[Term]:
     return [limit(*words, rates, -most, most, scale=10.0, skip=(1, 0))]
 
 
+# a target
+# ---------------------------------------------------------------------------------------------
+def rise() -> Term:
+    """The flight has the take-off speed of the target."""
+
+    def takeoff(p):
+        return p.c.vel_z - p.p.takeoff_speed
+
+    return Term("vertical take-off speed", "SL-E2, WL-E1", "m/s", "start", takeoff)
+
+
+def distance_flown(
+    body: Body, names: Sequence[str], left: Sequence[Contact], landed: Sequence[Contact]
+) -> Term:
+    """Each foot that has ``landed`` is as far ahead of where it stood first as those that ``left``,
+    and the distance of the target; contacts by number of the phase, of which ``names`` are given,
+    and side.
+    """
+
+    def ahead(ends, contact):
+        k, side = contact
+        return ends[names[k]].start.foothold(side)[0][0] - body.places[side][0]
+
+    def missed(ends):
+        from_here = sum(ahead(ends, contact) for contact in left) / len(left)
+        asked = from_here + ends[names[0]].start.p.distance
+        return ca.vertcat(*(ahead(ends, contact) - asked for contact in landed))
+
+    return Term("distance of the flight", "WL-E1", "m", "problem", missed)
+
+
 # touchdown at the end of the schedule
 # ---------------------------------------------------------------------------------------------
 def touchdown_rows(m: Mode) -> list[Term]:
@@ -417,16 +459,13 @@ def touchdown_rows(m: Mode) -> list[Term]:
         bent = body.knees[: len(free.sides)]
         return ca.vertcat(*(sign * p.tree.q[BASE + k] + angle for k, sign, angle in bent))
 
-    def takeoff(p):
-        return p.c.vel_z - p.p.takeoff_speed
-
     # hips that hardly bend let a robot squat less than a landing should have
     bent = min(lim.touchdown_knee[0], body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
     trunk = rates_within(m, lim.touchdown_trunk_rate, np.eye(3)[0][angles])
     rate = lim.touchdown_joint_rate
     turning = "trunk rates at touchdown", "ours", "rad/s", "end"
     return [
-        Term("vertical take-off speed", "SL-E2, WL-E1", "m/s", "start", takeoff),
+        rise(),
         *touchdown_feet(m),
         limit("attitude at touchdown", "ours", "rad", "end", attitude, low, high),
         limit("knees at touchdown", "ours: stroke", "rad", "end", knees, *bent),
