@@ -44,6 +44,17 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
     return pin.Quaternion(np.asarray(quaternion, float)).toRotationMatrix()
 
 
+def rotations(quaternions: np.ndarray) -> np.ndarray:
+    """Rotations (..., 3, 3) of many quaternions (..., 4), x y z w."""
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
 def turned(q: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """A copy of ``q`` (nq,) with its base turned in place by ``turn`` (3, 3), world axes."""
     out = q.copy()

@@ -18,7 +18,6 @@ from jumplab.sim import STEP_S
 
 # share of its rate that friction may take from a joint within a step: it must not turn it back
 STOPPING = 0.5
-LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Armature:
@@ -32,45 +31,48 @@ class Armature:
         self._data = model.createData()
         self._armature = robot.limits.armature
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._motors = []
-        self._joints = {}  # of links
-        self.lent = {}
+        bodies = range(model.njoints)
         links = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
         first = {frame.parentJoint: frame.name for frame in links[::-1]}  # of each joint's body
-        for name, armature in zip(robot.joint_names, self._armature, strict=True):
-            if armature:
-                here = model.getJointId(name)
-                column = model.idx_vs[here]
-                slope = pin.computeJointJacobian(model, self._data, pin.neutral(model), here)
-                bodies = {first[body]: body for body in (here, model.parents[here])}
-                self._joints |= bodies
-                for link in bodies:
-                    self.lent[link] = self.lent.get(link, 0.0) + armature
-                self._motors.append((*bodies, armature * slope[3:, column], column))
+        self.lent: dict[str, float] = {}
+        self._lent = np.zeros((len(bodies), 1))  # by body
+        # which bodies each joint carries
+        self._carries = np.zeros((len(robot.joint_names), len(bodies)))
+        for k, name in enumerate(robot.joint_names):
+            here = model.getJointId(name)
+            self._carries[k, list(model.subtrees[here])] = 1.0
+            for body in (here, model.parents[here]) if self._armature[k] else ():
+                self._lent[body] += self._armature[k]
+                self.lent[first[body]] = float(self._lent[body, 0])
         # views of Pinocchio's own numbers, which are new after each of its passes
-        self._turns = {link: self._data.oMi[joint].rotation for link, joint in self._joints.items()}
+        self._turns = [self._data.oMi[body].rotation for body in bodies]
         self._twists = [twist.angular for twist in self._data.v]
 
-    def returned(self, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-        """Torque (3,) for each link, world axes, in the step that begins at ``q`` (nq,) and ``v``
-        (nv,) [N m]; to be called once for each step."""
-        now = self._spins(q, v), v
+    def returned(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Generalised forces (nv,) in the step that begins at ``q`` (nq,) and ``v`` (nv,): moments
+        in the base's axes and torques [N m]; to be called once for each step.
+        """
+        now = self._spins(q, v), v[6:]
         change, rate = ((x - y) / STEP_S for x, y in zip(now, self._last or now, strict=True))
         self._last = now
-        turns = self._turns
-        out = {
-            link: turns[link] @ (self.lent[link] * change[k]) for link, k in self._joints.items()
-        }
-        for child, parent, along, column in self._motors:
-            torque = turns[child] @ along * rate[column]
-            out[child] -= torque
-            out[parent] += torque
-        return out
+        return self._forces(change, rate)
 
     def _spins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Angular velocities (joints, 3) of all bodies in their joints' axes."""
+        """Angular velocities (bodies, 3) in their joints' axes."""
         pin.forwardKinematics(self._model, self._data, q, v)
         return np.array(self._twists)
+
+    def _forces(self, change: np.ndarray, rate: np.ndarray) -> np.ndarray:
+        """Generalised forces (nv,) of the links' lent inertia where their spins ``change``
+        (bodies, 3), less those of the rotors at the ``rate`` (nv - 6,) of the joints' speeds.
+        """
+        pin.computeJointJacobians(self._model, self._data)
+        moments = np.matmul(self._turns, (self._lent * change)[:, :, None])[:, :, 0]
+        axes = self._data.J[3:, 6:].T
+        out = np.zeros(self._model.nv)
+        out[3:6] = moments.sum(axis=0) @ self._turns[1]
+        out[6:] = (axes * (self._carries @ moments)).sum(axis=1) - self._armature * rate
+        return out
 
     def late(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Generalised forces (N - 1, nv) that acted because of the delay, from a log (N, nq), (N,
@@ -81,15 +83,12 @@ class Armature:
         """
         spins = np.array([self._spins(*row) for row in zip(q, v, strict=True)])
         changes = (np.diff(x, axis=0) / STEP_S for x in (spins, v[:, 6:]))
-        late, rate = (-np.diff(x, axis=0, prepend=np.zeros_like(x[:1])) for x in changes)
-        out = np.zeros((len(late), self._model.nv))
-        out[:, 6:] = -self._armature * rate
-        for k, row in enumerate(late):
-            pin.computeJointJacobians(self._model, self._data, q[k])
-            for link, joint in self._joints.items():
-                slope = pin.getJointJacobian(self._model, self._data, joint, LOCAL)[3:]
-                out[k] += self.lent[link] * slope.T @ row[joint]
-        return out
+        late = (-np.diff(x, axis=0, prepend=np.zeros_like(x[:1])) for x in changes)
+        out = []
+        for place, *rates in zip(q[:-1], *late, strict=True):
+            pin.forwardKinematics(self._model, self._data, place)
+            out.append(self._forces(*rates))
+        return np.array(out)
 
 
 class Friction:
