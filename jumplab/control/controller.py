@@ -146,6 +146,7 @@ class Controller:
         self._shifts = reaim and flip
         size = self.landing.body.size
         self._yield_s = size.of(FLIP_YIELD_S if flip else YIELD_S, "s") + hardware.delay_s
+        self._settling = size.of(SETTLING_S, "s") / STEP_S
         touches_n = size.of(TOUCHDOWN_FORCE_N, "N")
         self._touches_n = max(touches_n, SURE * np.sqrt(2) * hardware.force_noise_n)
         self._looks_from = round(_looks_from_s(tape, self._awaited) / STEP_S)
@@ -176,7 +177,10 @@ class Controller:
         """Values to send to the joints' drives at ``t`` since the tape began [s], from the measured
         ``state``; to be called once in each :data:`~jumplab.control.STEP_S`.
         """
-        command = self.command(round(t / STEP_S), state.along(self.looks_rad))
+        step = round(t / STEP_S)
+        if self.touchdown is not None and not self._decides(step - self.touchdown):
+            return Drive(self._tau)
+        command = self.command(step, state.along(self.looks_rad))
         if command.q is None:
             return Drive(command.tau)
         return self._servo.drive(command, *(command.state or state[:2]))
@@ -224,15 +228,18 @@ class Controller:
 
     def _land(self, since: int, state: State) -> Command:
         """The landing controller's torque, ``since`` touchdown in steps."""
-        landing = self.landing
-        q, v, wrench = state
-        time = since * STEP_S
-        if self.ahead.again and self.ahead.followed == "planned" and self.stepped_s is None:
-            landing.reference = self.ahead.follow(time, q, v, landing.reference)
-        every = PERIOD_STEPS if time < landing.body.size.of(SETTLING_S, "s") else CALM_STEPS
-        if since % every == 0:
-            self._tau = landing.torque(time, q, v, wrench[:, 2])
+        if self._decides(since):
+            landing = self.landing
+            q, v, _ = state
+            time = since * STEP_S
+            if self.ahead.again and self.ahead.followed == "planned" and self.stepped_s is None:
+                landing.reference = self.ahead.follow(time, q, v, landing.reference)
+            self._tau = landing.torque(time, q, v, state.wrench[:, 2])
         return Command(tau=self._tau)
+
+    def _decides(self, since: int) -> bool:
+        """Whether the landing controller poses a QP ``since`` touchdown in steps."""
+        return since % (PERIOD_STEPS if since < self._settling else CALM_STEPS) == 0
 
     def _look_ahead(self, step: int, now: Motion, left: float) -> None:
         """Plan the landing for the touchdown in ``left`` seconds."""

@@ -102,16 +102,16 @@ class Flight:
         """Time until the soles meet the ground [s] in a flight that is measured ``now``; inf if
         they never do.
         """
-        x, _, z = now.com
-        vx, _, vz = now.velocity
+        x, _, z = now.com.tolist()
+        vx, _, vz = now.velocity.tolist()
         left = 0.0
         for _ in range(2):  # the ground's height depends on where, and so on when
             drop = z + self._below - self._ground(x + vx * left + self._ahead)
             root = vz**2 + 2 * self._gravity * drop
             if root < 0:
                 return np.inf
-            left = (vz + np.sqrt(root)) / self._gravity
-        return float(left)
+            left = (vz + root**0.5) / self._gravity
+        return left
 
     def state(
         self, now: Motion, turn: np.ndarray, left_s: float, correction: np.ndarray | float = 0.0

@@ -4,6 +4,7 @@ and soles.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -19,14 +20,22 @@ class State(NamedTuple):
 
     q: np.ndarray  # (nq,) configuration
     v: np.ndarray  # (nv,) velocity
-    # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
-    wrench: np.ndarray
+    # what the feet feel, or a function that measures it once it is asked for
+    feet: np.ndarray | Callable[[], np.ndarray]
+
+    @property
+    def wrench(self) -> np.ndarray:
+        """(2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N
+        m].
+        """
+        return self.feet() if callable(self.feet) else self.feet
 
     def along(self, heading_rad: float) -> State:
         """The same, as seen along a heading."""
         if heading_rad == 0:
             return self
-        return State(headed(self.q, heading_rad), self.v, turned_wrench(self.wrench, heading_rad))
+        q = headed(self.q, heading_rad)
+        return State(q, self.v, lambda: turned_wrench(self.wrench, heading_rad))
 
 
 class Motion(NamedTuple):
@@ -142,9 +151,21 @@ class Gauge:
         """CoM (3,) in ``q`` (nq,) [m]."""
         return pin.centerOfMass(self.model, self.data, q, False).copy()
 
+    def transforms(self, q: np.ndarray) -> np.ndarray:
+        """Homogeneous transforms (N, 2, 4, 4) of both feet in configurations ``q`` (N, nq)."""
+        joints = [self.model.frames[frame].parentJoint for frame in self.frames]
+        carried = [self.model.frames[frame].placement.homogeneous for frame in self.frames]
+        out = np.empty((len(q), len(joints), 4, 4))
+        for row, here in zip(q, out, strict=True):
+            pin.forwardKinematics(self.model, self.data, row)
+            for side, joint in enumerate(joints):
+                here[side] = self.data.oMi[joint].homogeneous
+        return out @ np.array(carried)
+
     def motion(self, q: np.ndarray, v: np.ndarray) -> Motion:
         """Motion of the whole robot in ``q`` (nq,) and ``v`` (nv,)."""
         data = self.data
         pin.ccrba(self.model, data, q, v)
-        velocity = data.hg.linear / self.robot.total_mass
-        return Motion(q, data.com[0].copy(), velocity, data.hg.angular.copy(), data.Ig.inertia)
+        momentum = data.hg
+        velocity = momentum.linear / self.robot.total_mass
+        return Motion(q, data.com[0].copy(), velocity, momentum.angular.copy(), data.Ig.inertia)

@@ -172,4 +172,5 @@ def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def between(rows: np.ndarray, at: float) -> np.ndarray:
     """The row (...) of ``rows`` (N, ...) at a place between two."""
     low = min(int(at), len(rows) - 2)
-    return rows[low] + min(at - low, 1.0) * (rows[low + 1] - rows[low])
+    share = min(at - low, 1.0)
+    return rows[low] + share * (rows[low + 1] - rows[low]) if share else rows[low]

@@ -93,7 +93,7 @@ class Run:
                 if step % TOLD == 0:
                     tell(f"simulated {step * STEP_S:.1f} s")
                 q, v = engine.state()
-                state = perceive(State(q, v, engine.wrench()))
+                state = perceive(State(q, v, engine.wrench))
                 sent.append(drive(step * STEP_S, state))
                 arriving = sent[0].torque(state.q[7:], state.v[6:])
                 engine.set_torque(motors.deliver(arriving, v[6:]))

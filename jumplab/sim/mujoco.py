@@ -277,9 +277,9 @@ class MujocoEngine(Engine):
 
     def _decoded(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, ...]:
         """Forces are means over a step; moments are about where the feet were before it."""
-        on_feet, origins, felt = (np.array(x) for x in list(zip(*notes, strict=True))[:3])
+        on_feet, origins, felt = (np.array([note[k] for note in notes]) for k in range(3))
         # by step, the engine's own one and foot: force and moment on the ground, and where they act
-        force, turning, place = np.moveaxis(on_feet, -2, 0)
+        force, turning, place = (on_feet[..., k, :] for k in range(3))
         turning = turning + moments(place - origins[:, None], force)
         wrench = -np.concatenate([force, turning], axis=-1).mean(axis=1)
         forces = felt[:, 3:].reshape(len(felt), -1, 3, 3)[:, :, 0]

@@ -80,7 +80,7 @@ class Perception:
         """The true ``state`` as far as the robot knows it."""
         if self._estimator is None:
             return state
-        reading = self._sensors.read(*state)
+        reading = self._sensors.read(*state[:2], state.wrench)
         q, v = self._estimator.update(reading)
         self._worst = np.maximum(self._worst, estimation_error(*state[:2], q, v))
         return State(q, v, reading.foot_wrench)
