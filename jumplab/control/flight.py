@@ -78,7 +78,7 @@ class Flight:
         self._ground = ground
         self._q = tape.q[-1].copy()
         self._v = tape.v[-1].copy()
-        self._ahead, _, self._below = gauge.soles(self._q) - gauge.com(self._q)
+        self._ahead, _, self._below = (gauge.soles(self._q) - gauge.com(self._q)).tolist()
         flight = tape.flights[-1]
         q = tape.q[flight]
         self._t = tape.t[flight]

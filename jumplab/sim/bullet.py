@@ -111,10 +111,9 @@ def base_from_bullet(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
     attitude = rotation(quaternion)
-    local_rate = attitude.T @ rate
-    local_velocity = attitude.T @ velocity - pin.skew(local_rate) @ lever
-    q = np.concatenate([position - attitude @ lever, quaternion])
-    return q, np.concatenate([local_velocity, local_rate])
+    arm = attitude @ lever
+    twist = np.array([velocity - moments(rate, arm), rate]) @ attitude
+    return np.concatenate([position - arm, quaternion]), twist.ravel()
 
 
 class BulletEngine(Engine):
@@ -242,11 +241,11 @@ class BulletEngine(Engine):
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
         pose = self._bullet.getBasePositionAndOrientation(self._body)
         twist = self._bullet.getBaseVelocity(self._body)
-        base_q, base_v = base_from_bullet(*(np.array(x) for x in (*pose, *twist)), self._lever)
-        joints = np.array(
-            [row[:2] for row in self._bullet.getJointStates(self._body, self._joints)]
-        )
-        return np.concatenate([base_q, joints[:, 0]]), np.concatenate([base_v, joints[:, 1]])
+        base = np.array([x for part in (*pose, *twist) for x in part])
+        base_q, base_v = base_from_bullet(*np.split(base, [3, 7, 10]), self._lever)
+        rows = self._bullet.getJointStates(self._body, self._joints)
+        angles, rates = np.array([row[:2] for row in rows]).T
+        return np.concatenate([base_q, angles]), np.concatenate([base_v, rates])
 
     def set_torque(self, tau: np.ndarray) -> None:
         """Torque of every joint for the next step [N m]."""
