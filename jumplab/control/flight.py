@@ -181,12 +181,12 @@ class Flight:
         if left_s > STEP_S:
             middle, pace, dt = self.pieces(self._size, t, left_s, TURNS)
             rows = np.interp(middle, self._t, np.arange(len(self._t)))
-            for row, faster in zip(rows, pace, strict=True):
-                inertia = between(self._inertias, row)
+            ways = np.linalg.inv([between(self._inertias, row) for row in rows])
+            for row, faster, way in zip(rows, pace, ways, strict=True):
                 carried = faster * between(self._momenta, row)
                 halfway = attitude
                 for part in (dt / 2, dt):
-                    spin = np.linalg.solve(inertia, halfway.T @ now.momentum - carried)
+                    spin = way @ (now.momentum @ halfway - carried)
                     halfway = attitude @ pin.exp3(spin * part)
                 attitude = halfway
         return attitude @ rotation(self._q[3:7]).T

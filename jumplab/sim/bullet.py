@@ -241,8 +241,7 @@ class BulletEngine(Engine):
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
         pose = self._bullet.getBasePositionAndOrientation(self._body)
         twist = self._bullet.getBaseVelocity(self._body)
-        base = np.array([x for part in (*pose, *twist) for x in part])
-        base_q, base_v = base_from_bullet(*np.split(base, [3, 7, 10]), self._lever)
+        base_q, base_v = base_from_bullet(*map(np.array, (*pose, *twist)), self._lever)
         rows = self._bullet.getJointStates(self._body, self._joints)
         angles, rates = np.array([row[:2] for row in rows]).T
         return np.concatenate([base_q, angles]), np.concatenate([base_v, rates])

@@ -168,9 +168,8 @@ class Engine(ABC):
         """True configuration (nq,) and velocity (nv,), in Pinocchio's conventions."""
         if self._now is None:
             self._now = self._read()
-            for array in self._now:  # which the log keeps
-                array.setflags(write=False)
-        return self._now
+        q, v = self._now
+        return q.copy(), v.copy()
 
     @abstractmethod
     def _read(self) -> tuple[np.ndarray, np.ndarray]:

@@ -279,9 +279,10 @@ class MujocoEngine(Engine):
         """Forces are means over a step; moments are about where the feet were before it."""
         on_feet, origins, felt = (np.array([note[k] for note in notes]) for k in range(3))
         # by step, the engine's own one and foot: force and moment on the ground, and where they act
-        force, turning, place = (on_feet[..., k, :] for k in range(3))
-        turning = turning + moments(place - origins[:, None], force)
-        wrench = -np.concatenate([force, turning], axis=-1).mean(axis=1)
+        force = on_feet[..., 0, :]
+        total = on_feet[..., :2, :].sum(axis=1)
+        total[..., 1, :] += moments(on_feet[..., 2, :] - origins[:, None], force).sum(axis=1)
+        wrench = (total / -on_feet.shape[1]).reshape(-1, 2, 6)
         forces = felt[:, 3:].reshape(len(felt), -1, 3, 3)[:, :, 0]
         return wrench, forces.any(axis=-1), felt[:, :3].any(axis=-1)
 

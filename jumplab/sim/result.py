@@ -280,10 +280,10 @@ def record(
 ) -> SimulationResult:
     """The finished record of a run of ``robot`` as it really is, whose ``links`` are named.
 
-    ``steps`` are those of the engine; ``goal`` (nq,) is how the tape ends, where the ground is really
-    ``higher_m`` higher [m], after so many ``flights``, of which the last one ends on the feet
-    ``lands`` (0 left, 1 right); ``solves`` are QPs posed and failed. Raises :class:`SolverError`
-    if the engine's numbers have exploded.
+    ``steps`` are those of the engine; ``goal`` (nq,) is how the tape ends, where the ground is
+    really ``higher_m`` higher [m], after so many ``flights``, of which the last one ends on the
+    feet ``lands`` (0 left, 1 right); ``solves`` are QPs posed and failed. Raises
+    :class:`SolverError` if the engine's numbers have exploded.
     """
     q, v, tau, wrench, touching, colliding = steps
     if not (np.isfinite(q).all() and np.isfinite(v).all()):

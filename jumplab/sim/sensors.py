@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.control.estimator import Estimator, Reading, SensorNoise
-from jumplab.control.kinematics import State, rotation, turned
+from jumplab.control.kinematics import State, rotation, rotations, turned
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.task import GRAVITY
@@ -72,7 +72,7 @@ class Perception:
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise, seed: int):
         self._sensors = Sensors(noise, seed, robot.gravity)
-        self._worst = np.zeros(2)  # errors of tilt [rad] and velocity [m/s]
+        self._errors: list[tuple[np.ndarray, ...]] = []  # true and believed states
         exact = noise == SensorNoise()  # then the true state stands for its estimate
         self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
 
@@ -82,14 +82,15 @@ class Perception:
             return state
         reading = self._sensors.read(*state[:2], state.wrench)
         q, v = self._estimator.update(reading)
-        self._worst = np.maximum(self._worst, estimation_error(*state[:2], q, v))
+        self._errors.append((*state[:2], q, v))
         return State(q, v, reading.foot_wrench)
 
     def to_json(self) -> dict:
         """Kind of the state and its worst errors, for the settings of a result."""
         if self._estimator is None:
             return {"state": "true"}
-        tilt, speed = self._worst.tolist()
+        states = map(np.array, zip(*self._errors, strict=True))
+        tilt, speed = (float(x.max()) for x in estimation_error(*states))
         return {
             "state": "estimated",
             "worst_tilt_error_rad": tilt,
@@ -99,9 +100,15 @@ class Perception:
 
 def estimation_error(
     q: np.ndarray, v: np.ndarray, believed_q: np.ndarray, believed_v: np.ndarray
-) -> tuple[float, float]:
-    """Error of roll and pitch together [rad], and of the base's velocity in the world [m/s]."""
-    true, believed = (rotation(x[3:7]) for x in (q, believed_q))
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (...) of roll and pitch together [rad], and of the base's velocity in the world [m/s],
+    in states (..., nq) and (..., nv).
+    """
+    true, believed = (rotations(x[..., 3:7]) for x in (q, believed_q))
     # between the two ideas of up, in the trunk's axes
-    tilt = np.arccos(np.clip(true[2] @ believed[2], -1.0, 1.0))
-    return float(tilt), float(np.linalg.norm(believed @ believed_v[:3] - true @ v[:3]))
+    level = (true[..., 2, :] * believed[..., 2, :]).sum(axis=-1)
+    moved = (
+        np.einsum("...ij,...j->...i", *x)
+        for x in ((believed, believed_v[..., :3]), (true, v[..., :3]))
+    )
+    return np.arccos(np.clip(level, -1.0, 1.0)), np.linalg.norm(np.subtract(*moved), axis=-1)
