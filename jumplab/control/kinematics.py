@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial.transform import Rotation
 
 from jumplab.robot import Robot
 
@@ -55,13 +56,8 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
     """Rotations (..., 3, 3) of many quaternions (..., 4), x y z w."""
-    x, y, z, w = np.moveaxis(quaternions, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    turns = Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix()
+    return turns.reshape(*quaternions.shape[:-1], 3, 3)
 
 
 def turned(q: np.ndarray, turn: np.ndarray) -> np.ndarray:

@@ -31,47 +31,43 @@ class Armature:
         self._data = model.createData()
         self._armature = robot.limits.armature
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        bodies = range(model.njoints)
         links = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
         first = {frame.parentJoint: frame.name for frame in links[::-1]}  # of each joint's body
         self.lent: dict[str, float] = {}
-        self._lent = np.zeros((len(bodies), 1))  # by body
-        # which bodies each joint carries
-        self._carries = np.zeros((len(robot.joint_names), len(bodies)))
+        self._lent = np.zeros((model.njoints, 1))  # by body
+        # which bodies move with each entry of v
+        self._carries = np.ones((model.nv, model.njoints))
         for k, name in enumerate(robot.joint_names):
             here = model.getJointId(name)
-            self._carries[k, list(model.subtrees[here])] = 1.0
+            self._carries[6 + k] = np.isin(range(model.njoints), list(model.subtrees[here]))
             for body in (here, model.parents[here]) if self._armature[k] else ():
                 self._lent[body] += self._armature[k]
                 self.lent[first[body]] = float(self._lent[body, 0])
-        # views of Pinocchio's own numbers, which are new after each of its passes
-        self._turns = [self._data.oMi[body].rotation for body in bodies]
-        self._twists = [twist.angular for twist in self._data.v]
 
     def returned(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Generalised forces (nv,) in the step that begins at ``q`` (nq,) and ``v`` (nv,): moments
         in the base's axes and torques [N m]; to be called once for each step.
         """
-        now = self._spins(q, v), v[6:]
-        change, rate = ((x - y) / STEP_S for x, y in zip(now, self._last or now, strict=True))
+        axes = self._axes(q)
+        now = self._spins(axes, v), v[6:]
+        changes = ((x - y) / STEP_S for x, y in zip(now, self._last or now, strict=True))
         self._last = now
-        return self._forces(change, rate)
+        return self._forces(axes, *changes)
 
-    def _spins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Angular velocities (bodies, 3) in their joints' axes."""
-        pin.forwardKinematics(self._model, self._data, q, v)
-        return np.array(self._twists)
+    def _axes(self, q: np.ndarray) -> np.ndarray:
+        """Axes (nv, 3) about which each entry of the velocity turns bodies, in the world's."""
+        return pin.computeJointJacobians(self._model, self._data, q)[3:].T
 
-    def _forces(self, change: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    def _spins(self, axes: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Angular velocities (bodies, 3) in the world's axes."""
+        return self._carries.T @ (axes * v[:, None])
+
+    def _forces(self, axes: np.ndarray, change: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Generalised forces (nv,) of the links' lent inertia where their spins ``change``
         (bodies, 3), less those of the rotors at the ``rate`` (nv - 6,) of the joints' speeds.
         """
-        pin.computeJointJacobians(self._model, self._data)
-        moments = np.matmul(self._turns, (self._lent * change)[:, :, None])[:, :, 0]
-        axes = self._data.J[3:, 6:].T
-        out = np.zeros(self._model.nv)
-        out[3:6] = moments.sum(axis=0) @ self._turns[1]
-        out[6:] = (axes * (self._carries @ moments)).sum(axis=1) - self._armature * rate
+        out = (axes * (self._carries @ (self._lent * change))).sum(axis=1)
+        out[6:] -= self._armature * rate
         return out
 
     def late(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -81,14 +77,11 @@ class Armature:
         The torque given back in a step, less the one due in it: summed over any time, this is the
         difference of those due at its two ends.
         """
-        spins = np.array([self._spins(*row) for row in zip(q, v, strict=True)])
+        axes = [self._axes(row) for row in q]
+        spins = np.array([self._spins(*row) for row in zip(axes, v, strict=True)])
         changes = (np.diff(x, axis=0) / STEP_S for x in (spins, v[:, 6:]))
         late = (-np.diff(x, axis=0, prepend=np.zeros_like(x[:1])) for x in changes)
-        out = []
-        for place, *rates in zip(q[:-1], *late, strict=True):
-            pin.forwardKinematics(self._model, self._data, place)
-            out.append(self._forces(*rates))
-        return np.array(out)
+        return np.array([self._forces(*row) for row in zip(axes[:-1], *late, strict=True)])
 
 
 class Friction:
