@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumplab.arguments import checked
+from jumplab.arguments import checked, real, shaped
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.estimator import SURE
@@ -25,7 +25,7 @@ from jumplab.control.kinematics import (
 )
 from jumplab.control.landing import LandingController
 from jumplab.control.launch import LaunchFeedback, check_mode
-from jumplab.control.playback import Command, Playback
+from jumplab.control.playback import Command, Playback, check_tape
 from jumplab.control.reaim import Reaim
 from jumplab.control.reference import LEAD_S, LandingAhead
 from jumplab.control.servo import Drive, servo_of
@@ -114,6 +114,7 @@ class Controller:
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {quoted(landing)}: must be one of {', '.join(LANDINGS)}")
+        check_tape(tape, robot)
         self.goal = tape.q[-1]
         tape = tape.until(tape.caught)
         self._gauge = Gauge(robot)
@@ -170,7 +171,21 @@ class Controller:
     def torque(self, t: float, state: State) -> np.ndarray:
         """Joint torques (nv - 6,) [N m] at ``t`` since the tape began [s], from the measured
         ``state``: what drives make of :meth:`drive` that have the same encoders and get it at once.
+
+        Without any simulator: call it once in each :data:`~jumplab.control.STEP_S` with a
+        :class:`.kinematics.State` of what the robot measures, and send the torques to the motors.
+        Raises :class:`InputError` where the state is no number, or not this robot's.
         """
+        model = self._gauge.model
+        sizes = {"q": (model.nq,), "v": (model.nv,), "wrench": (2, 6)}
+        t = real(t, "t", "s")
+        state = State(*(shaped(getattr(state, k), n, f"the state's {k}") for k, n in sizes.items()))
+        for name, x in zip(sizes, state, strict=True):
+            if not np.isfinite(x).all():
+                raise InputError(
+                    f"the state's {name} has entries that are no number at t = {t:g} s; "
+                    "stop the motors and check the sensors"
+                )
         return self.drive(t, state).torque(state.q[7:], state.v[6:])
 
     def drive(self, t: float, state: State) -> Drive:

@@ -56,12 +56,7 @@ class Playback:
     """
 
     def __init__(self, tape: Tape, robot: Robot, lead_s: float = 0.0):
-        names = tuple(map(str, tape.joint_names))
-        if names != robot.joint_names:
-            raise InputError(
-                f"the tape's joints {', '.join(names[:3])} ... are not those of robot "
-                f"{robot.name}; plan the jump again with this robot"
-            )
+        check_tape(tape, robot)
         self.steps = round(float(tape.t[-1]) / STEP_S)
         self.lead = round(lead_s / STEP_S)
         self._gauge = Gauge(robot)
@@ -161,6 +156,16 @@ class Playback:
         gained = between(self._v, due) - between(self._v, now)
         base = self.lead * STEP_S * (v[:6] + gained[:6] / 2)
         return pin.integrate(self._gauge.model, q, np.concatenate([base, moved])), v + gained
+
+
+def check_tape(tape: Tape, robot: Robot) -> None:
+    """Refuse (:class:`InputError`) a tape of another robot's joints."""
+    names = tuple(map(str, tape.joint_names))
+    if names != robot.joint_names:
+        raise InputError(
+            f"the tape's joints {', '.join(names[:3])} ... are not those of robot "
+            f"{robot.name}; plan the jump again with this robot"
+        )
 
 
 def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:
