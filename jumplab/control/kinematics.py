@@ -147,17 +147,6 @@ class Gauge:
         """CoM (3,) in ``q`` (nq,) [m]."""
         return pin.centerOfMass(self.model, self.data, q, False).copy()
 
-    def transforms(self, q: np.ndarray) -> np.ndarray:
-        """Homogeneous transforms (N, 2, 4, 4) of both feet in configurations ``q`` (N, nq)."""
-        joints = [self.model.frames[frame].parentJoint for frame in self.frames]
-        carried = [self.model.frames[frame].placement.homogeneous for frame in self.frames]
-        out = np.empty((len(q), len(joints), 4, 4))
-        for row, here in zip(q, out, strict=True):
-            pin.forwardKinematics(self.model, self.data, row)
-            for side, joint in enumerate(joints):
-                here[side] = self.data.oMi[joint].homogeneous
-        return out @ np.array(carried)
-
     def motion(self, q: np.ndarray, v: np.ndarray) -> Motion:
         """Motion of the whole robot in ``q`` (nq,) and ``v`` (nv,)."""
         data = self.data
