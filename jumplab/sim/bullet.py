@@ -298,16 +298,20 @@ class BulletEngine(Engine):
             feet = np.array([(*state[4], *state[5]) for state in states])
         self._notes.append((np.array(points).reshape(-1, POINT), colliding, feet))
 
-    def _decoded(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, ...]:
+    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
         step, link, arm, force, _ = self._presses(notes)
-        touching = np.zeros((len(notes), len(self.links)), bool)
-        touching[step, link + 1] = True
         wrench = np.zeros((len(notes), 2, 6))
         pushes = np.hstack([force, moments(arm, force)])
         for side, foot in enumerate(self._feet):
             on_it = link == foot
             np.add.at(wrench[:, side], step[on_it], pushes[on_it])
-        return wrench, touching, np.array([note[1] for note in notes])
+        return wrench
+
+    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
+        step, link, *_ = self._presses(notes)
+        touching = np.zeros((len(notes), len(self.links)), bool)
+        touching[step, link + 1] = True
+        return touching, np.array([note[1] for note in notes])
 
     def _presses(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, ...]:
         """Of all k points that were noted: step, link, place (k, 3) from the foot, force (k, 3) and

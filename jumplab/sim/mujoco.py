@@ -275,16 +275,19 @@ class MujocoEngine(Engine):
         note = self._felt[:, self._on_feet], origins, felt
         self._notes.append((*note, *(x.copy() for x in places)))
 
-    def _decoded(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, ...]:
+    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
         """Forces are means over a step; moments are about where the feet were before it."""
-        on_feet, origins, felt = (np.array([note[k] for note in notes]) for k in range(3))
+        on_feet, origins = (np.array([note[k] for note in notes]) for k in range(2))
         # by step, the engine's own one and foot: force and moment on the ground, and where they act
         force = on_feet[..., 0, :]
         total = on_feet[..., :2, :].sum(axis=1)
         total[..., 1, :] += moments(on_feet[..., 2, :] - origins[:, None], force).sum(axis=1)
-        wrench = (total / -on_feet.shape[1]).reshape(-1, 2, 6)
+        return (total / -on_feet.shape[1]).reshape(-1, 2, 6)
+
+    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
+        felt = np.array([note[2] for note in notes])
         forces = felt[:, 3:].reshape(len(felt), -1, 3, 3)[:, :, 0]
-        return wrench, forces.any(axis=-1), felt[:, :3].any(axis=-1)
+        return forces.any(axis=-1), felt[:, :3].any(axis=-1)
 
     def _sole_points(self) -> np.ndarray:
         touched = [note[3:] for note in self._notes if len(note[3])]

@@ -12,6 +12,7 @@ from jumplab.sim import STEP_S
 from jumplab.task import GRAVITY
 
 LEVER_M = 0.05  # a moment of a foot's sensor is wrong by as much as a force at this distance
+LEVERS = np.repeat([1.0, LEVER_M], 3)
 
 
 class Sensors:
@@ -41,28 +42,27 @@ class Sensors:
         per step.
         """
         n = self.noise
-        draw = self._rng.standard_normal
+        joints = len(v) - 6
+        # in this order: angles, rates, gyro, accelerometer, forces
+        errors = self._rng.standard_normal(2 * joints + 8)
         attitude = rotation(q[3:7])
         velocity = attitude @ v[:3]
         gained = np.zeros(3) if self._last_velocity is None else velocity - self._last_velocity
         self._last_velocity = velocity
         force = attitude.T @ (gained / STEP_S - self._gravity)
-        joints = q[7:] + n.joint_rad * draw(len(q) - 7)
+        angles = q[7:] + n.joint_rad * errors[:joints]
         if n.encoder_step_rad:
-            joints = n.encoder_step_rad * np.round(joints / n.encoder_step_rad)
+            angles = n.encoder_step_rad * np.round(angles / n.encoder_step_rad)
+        # in standard deviations of a force
+        felt = self._other.standard_normal((2, 6)) * LEVERS
+        felt[:, 2] = errors[-2:]
         return Reading(
-            joints,
-            v[6:] + n.joint_rate * draw(len(v) - 6),
-            v[3:6] + self._gyro_bias + n.gyro * draw(3),
-            force + self._accel_bias + n.accel * draw(3),
-            wrench + n.force * self._wrench_error(),
+            angles,
+            v[6:] + n.joint_rate * errors[joints:-8],
+            v[3:6] + self._gyro_bias + n.gyro * errors[-8:-5],
+            force + self._accel_bias + n.accel * errors[-5:-2],
+            wrench + n.force * felt,
         )
-
-    def _wrench_error(self) -> np.ndarray:
-        """Errors (2, 6) of the foot wrenches, in standard deviations of a force."""
-        error = self._other.standard_normal((2, 6)) * np.repeat([1.0, LEVER_M], 3)
-        error[:, 2] = self._rng.standard_normal(2)
-        return error
 
 
 class Perception:
