@@ -194,10 +194,10 @@ def _momentum_unexplained(result: SimulationResult) -> np.ndarray:
     robot = result.robot
     gauge = Gauge(robot)
     weight = robot.total_mass * robot.model.gravity.linear
-    rows = zip(result.q, result.v, strict=True)
-    com = result.com
-    linear = robot.total_mass * result.com_velocity
-    spin = np.array([gauge.motion(*row).momentum for row in rows]) + np.cross(com, linear)
+    motions = [gauge.motion(*row)[1:4] for row in zip(result.q, result.v, strict=True)]
+    com, velocity, spin = np.array(motions).swapaxes(0, 1)
+    linear = robot.total_mass * velocity
+    spin = spin + np.cross(com, linear)
     pushes, arm = _pushes(result)
     pushed = result.q[:, :3] + rotations(result.q[:, 3:7]) @ arm
     forces = result.foot_wrench[:, :, :3]
