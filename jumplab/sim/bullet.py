@@ -36,7 +36,7 @@ class Contact:
 HARD = Contact({"numSolverIterations": 1000, "contactERP": 0.1, "contactSlop": 1e-4})
 # friction combines as a product: the robot's coefficient is the effective one
 GROUND_FRICTION = 1.0
-POINT = 16  # numbers that are noted of a point of contact
+NOTHING = np.zeros((0, 16))  # what is noted of points on which ground presses, where it does not
 NOWHERE = np.tile(np.eye(7)[6], (2, 1))  # places and attitudes of the feet, where nothing presses
 FASTEST = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
 
@@ -296,7 +296,7 @@ class BulletEngine(Engine):
         if points:
             states = [self._bullet.getLinkState(self._body, foot) for foot in self._feet]
             feet = np.array([(*state[4], *state[5]) for state in states])
-        self._notes.append((np.array(points).reshape(-1, POINT), colliding, feet))
+        self._notes.append((np.array(points) if points else NOTHING, colliding, feet))
 
     def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
         step, link, arm, force, _ = self._presses(notes)
