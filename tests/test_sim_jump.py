@@ -29,8 +29,8 @@ from jumplab.sim import (
     SimulationResult,
 )
 from jumplab.sim import simulate_jump as simulate
+from jumplab.sim.engine import Log
 from jumplab.sim.result import events, record
-from jumplab.sim.scene import Contacts
 from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_state
 from jumplab.task import JumpTask
 
@@ -366,14 +366,13 @@ def test_any_gravity_and_size_is_measured_by_a_second_way(bhr, engine, task):
 
 
 def test_an_exploded_engine_is_an_error(bhr, tape):
-    nothing = Contacts(np.zeros((2, 6)), frozenset(), False)
-    row = (np.full(21, np.nan), np.zeros(20), np.zeros(14), nothing)
+    steps = [np.full(21, np.nan), *map(np.zeros, (20, 14, (2, 6), 3, ()))]
     with pytest.raises(SolverError, match="the engine lost the robot"):
-        record(bhr, [row], ("trunk", *bhr.foot.frames), tape.q[-1])
+        record(bhr, Log(*(x[None] for x in steps)), ("trunk", *bhr.foot.frames), tape.q[-1])
 
 
 def stepped(robot, q, right_up):
-    """Rows of a robot that stands, is carried 0.2 m ahead in the air, and lands on its left foot alone."""
+    """Log of a robot that stands, is carried 0.2 m ahead in the air, and lands on its left foot alone."""
     weight = robot.total_mass * robot.gravity
     down, pushed, left = (np.zeros((2, 6)) for _ in range(3))
     pushed[:, 2], left[0, 2] = weight / 2, weight
@@ -386,8 +385,10 @@ def stepped(robot, q, right_up):
     air = np.repeat(landed[None], 60, axis=0)
     air[:, 0] = q[0] + np.linspace(0.0, 0.2, 60)
     poses = [(q, pushed)] * 20 + [(x, down) for x in air] + [(landed, left)] * 20
-    touching = {True: frozenset(robot.foot.frames), False: frozenset()}
-    return [(x, *rest, Contacts(wrench, touching[bool(wrench.any())], False)) for x, wrench in poses]
+    wrench = np.array([wrench for _, wrench in poses])
+    feet = np.outer(wrench.any(axis=(1, 2)), [False, True, True])
+    still = (np.tile(x, (len(poses), 1)) for x in rest)
+    return Log(np.array([x for x, _ in poses]), *still, wrench, feet, np.zeros(len(poses), bool))
 
 
 def test_toes_at_touchdown_are_those_of_the_feet_that_are_to_land(bhr, tape):
@@ -396,8 +397,8 @@ def test_toes_at_touchdown_are_those_of_the_feet_that_are_to_land(bhr, tape):
     names = ("trunk", *bhr.foot.frames)
 
     def measured(right_up, lands):
-        rows = stepped(bhr, q, right_up)
-        return record(bhr, rows, names, rows[-1][0], lands=lands).metrics
+        steps = stepped(bhr, q, right_up)
+        return record(bhr, steps, names, steps.q[-1], lands=lands).metrics
 
     one = measured(0.6, (0,))
     assert one.touchdown_s == pytest.approx(0.08) and one.foot_distance_touchdown_m == pytest.approx(0.2)

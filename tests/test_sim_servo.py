@@ -1,5 +1,7 @@
 """The servos of all modes against the plan, against Pinocchio, and against a drive that is simply stiff."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -7,9 +9,11 @@ from fixtures_core import jump
 
 from jumplab.control import servo as law
 from jumplab.control.body import WholeBody
-from jumplab.control.kinematics import headed
-from jumplab.control.playback import AIR, FLAT, TOE, Command, Playback
-from jumplab.control.servo import STIFFNESS, PositionServo, TorqueServo, WholeBodyServo
+from jumplab.control.controller import Controller
+from jumplab.control.kinematics import State, headed
+from jumplab.control.playback import AIR, FLAT, TOE, Command, Playback, resampled
+from jumplab.control.servo import SERVOS, STIFFNESS, PositionServo, TorqueServo, WholeBodyServo
+from jumplab.errors import InputError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.robot_import.urdf import have_published
@@ -226,3 +230,36 @@ def test_what_is_sent_ahead_is_what_the_tape_takes_later(bhr, tape):
             miss = sent(ahead, step, step, error) - sent(plain, step + lead, step + lead, error)
             assert np.abs(miss / effort).max() < 1e-6, step
         assert np.abs((sent(ahead, step, step, off) - sent(ahead, step, step, none)) / effort).max() > 0.01
+
+
+@pytest.mark.parametrize("mode", SERVOS)
+def test_a_controller_runs_without_a_simulator_and_on_the_plan_gives_its_torques(bhr, tape, mode):
+    control = Controller(tape, bhr, mode=mode)
+    for row in range(0, 40, 8):  # still flat
+        t = round(float(tape.t[row]) / STEP_S) * STEP_S
+        q, v, a = (resampled(np.array([t]), tape.t, x)[0] for x in (tape.q, tape.v, tape.a))
+        due = pin.rnea(bhr.model, bhr.model.createData(), q, v, a)  # of which the ground holds the rest
+        tau = control.torque(t, State(q, v, np.zeros((2, 6))))
+        planned = resampled(np.array([t]), tape.t, tape.tau)[0]
+        assert np.abs((tau - planned) / bhr.limits.effort).max() < 0.02, (row, tau - planned)
+        assert np.abs(due[6:] - planned).max() > 1.0
+
+
+def test_states_that_are_no_robot_s_are_refused_in_a_sentence(bhr, tape):
+    state = dict(q=tape.q[0], v=tape.v[0], wrench=np.zeros((2, 6)))
+    control = Controller(tape, bhr)
+    for name, array in state.items():
+        broken = array.copy()
+        broken.flat[1] = np.nan
+        with pytest.raises(
+            InputError, match=rf"^the state's {name} has entries that are no number at t = 0\.5 s; stop"
+        ):
+            control.torque(0.5, State(*(state | {name: broken}).values()))
+        with pytest.raises(InputError, match=rf"^the state's {name} must have the shape \("):
+            control.torque(0.5, State(*(state | {name: array[:-1]}).values()))
+    with pytest.raises(InputError, match=r"^t must be finite"):
+        control.torque(np.nan, State(*state.values()))
+    renamed = tape.joint_names[::-1]
+    first = str(renamed[0])
+    with pytest.raises(InputError, match=rf"^the tape's joints {first}, .* are not those of robot bhr; plan the jump"):
+        Controller(replace(tape, joint_names=renamed), bhr)

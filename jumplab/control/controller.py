@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumplab.arguments import checked
+from jumplab.arguments import checked, real, shaped
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.estimator import SURE
@@ -25,7 +25,7 @@ from jumplab.control.kinematics import (
 )
 from jumplab.control.landing import LandingController
 from jumplab.control.launch import LaunchFeedback, check_mode
-from jumplab.control.playback import Command, Playback
+from jumplab.control.playback import Command, Playback, check_tape
 from jumplab.control.reaim import Reaim
 from jumplab.control.reference import LEAD_S, LandingAhead
 from jumplab.control.servo import Drive, servo_of
@@ -114,6 +114,7 @@ class Controller:
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {quoted(landing)}: must be one of {', '.join(LANDINGS)}")
+        check_tape(tape, robot)
         self.goal = tape.q[-1]
         tape = tape.until(tape.caught)
         self._gauge = Gauge(robot)
@@ -146,6 +147,7 @@ class Controller:
         self._shifts = reaim and flip
         size = self.landing.body.size
         self._yield_s = size.of(FLIP_YIELD_S if flip else YIELD_S, "s") + hardware.delay_s
+        self._settling = size.of(SETTLING_S, "s") / STEP_S
         touches_n = size.of(TOUCHDOWN_FORCE_N, "N")
         self._touches_n = max(touches_n, SURE * np.sqrt(2) * hardware.force_noise_n)
         self._looks_from = round(_looks_from_s(tape, self._awaited) / STEP_S)
@@ -169,14 +171,31 @@ class Controller:
     def torque(self, t: float, state: State) -> np.ndarray:
         """Joint torques (nv - 6,) [N m] at ``t`` since the tape began [s], from the measured
         ``state``: what drives make of :meth:`drive` that have the same encoders and get it at once.
+
+        Without any simulator: call it once in each :data:`~jumplab.control.STEP_S` with a
+        :class:`.kinematics.State` of what the robot measures, and send the torques to the motors.
+        Raises :class:`InputError` where the state is no number, or not this robot's.
         """
+        model = self._gauge.model
+        sizes = {"q": (model.nq,), "v": (model.nv,), "wrench": (2, 6)}
+        t = real(t, "t", "s")
+        state = State(*(shaped(getattr(state, k), n, f"the state's {k}") for k, n in sizes.items()))
+        for name, x in zip(sizes, state, strict=True):
+            if not np.isfinite(x).all():
+                raise InputError(
+                    f"the state's {name} has entries that are no number at t = {t:g} s; "
+                    "stop the motors and check the sensors"
+                )
         return self.drive(t, state).torque(state.q[7:], state.v[6:])
 
     def drive(self, t: float, state: State) -> Drive:
         """Values to send to the joints' drives at ``t`` since the tape began [s], from the measured
         ``state``; to be called once in each :data:`~jumplab.control.STEP_S`.
         """
-        command = self.command(round(t / STEP_S), state.along(self.looks_rad))
+        step = round(t / STEP_S)
+        if self.touchdown is not None and not self._decides(step - self.touchdown):
+            return Drive(self._tau)
+        command = self.command(step, state.along(self.looks_rad))
         if command.q is None:
             return Drive(command.tau)
         return self._servo.drive(command, *(command.state or state[:2]))
@@ -224,15 +243,18 @@ class Controller:
 
     def _land(self, since: int, state: State) -> Command:
         """The landing controller's torque, ``since`` touchdown in steps."""
-        landing = self.landing
-        q, v, wrench = state
-        time = since * STEP_S
-        if self.ahead.again and self.ahead.followed == "planned" and self.stepped_s is None:
-            landing.reference = self.ahead.follow(time, q, v, landing.reference)
-        every = PERIOD_STEPS if time < landing.body.size.of(SETTLING_S, "s") else CALM_STEPS
-        if since % every == 0:
-            self._tau = landing.torque(time, q, v, wrench[:, 2])
+        if self._decides(since):
+            landing = self.landing
+            q, v, _ = state
+            time = since * STEP_S
+            if self.ahead.again and self.ahead.followed == "planned" and self.stepped_s is None:
+                landing.reference = self.ahead.follow(time, q, v, landing.reference)
+            self._tau = landing.torque(time, q, v, state.wrench[:, 2])
         return Command(tau=self._tau)
+
+    def _decides(self, since: int) -> bool:
+        """Whether the landing controller poses a QP ``since`` touchdown in steps."""
+        return since % (PERIOD_STEPS if since < self._settling else CALM_STEPS) == 0
 
     def _look_ahead(self, step: int, now: Motion, left: float) -> None:
         """Plan the landing for the touchdown in ``left`` seconds."""

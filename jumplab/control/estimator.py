@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg.lapack import dposv
 
 from jumplab.control import STEP_S
 from jumplab.control.kinematics import LEVEL, Gauge, rotation
@@ -125,7 +126,6 @@ class Estimator:
         self._standing = [0, 0]
         floors = vars(FLOOR)
         n = SensorNoise(**{name: max(x, floors[name]) for name, x in vars(noise).items()})
-        self._noise = n
         large = size(robot)
         self._tipped_m = large.of(TIPPED_M, "m")
         self._settle_s = large.of(SETTLE_S, "s")
@@ -138,6 +138,14 @@ class Estimator:
         # how errors grow within a step; what does not change from step to step
         self._step = np.eye(SIZE)
         self._step[PLACE, SPEED] = STEP_S * UNIT
+        self._drive = np.zeros(SIZE)
+        self._drive[TURN] = (n.gyro * STEP_S) ** 2
+        self._drive[SPEED] = (n.accel * STEP_S) ** 2
+        # how each foot's place off the leg's is felt; of the tilt, it depends on the arm
+        self._senses = np.zeros((2, 3, SIZE))
+        self._senses[:, :, PLACE] = -UNIT
+        for sense, foot in zip(self._senses, FEET, strict=True):
+            sense[:, foot] = UNIT
 
     def update(self, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
         """Estimated configuration (nq,) and velocity (nv,) at the time of ``reading``."""
@@ -160,9 +168,7 @@ class Estimator:
         step = self._step
         step[SPEED, TURN] = -STEP_S * pin.skew(push)
         step[TURN, GYRO] = step[SPEED, ACCEL] = -STEP_S * self._attitude
-        drive = np.zeros(SIZE)
-        drive[TURN] = (self._noise.gyro * STEP_S) ** 2
-        drive[SPEED] = (self._noise.accel * STEP_S) ** 2
+        drive = self._drive
         for foot, steps in zip(FEET, self._standing, strict=True):
             walk = SETTLE_WALK if steps * STEP_S < self._settle_s else FOOT_WALK
             drive[foot] = walk**2 * STEP_S
@@ -195,30 +201,23 @@ class Estimator:
         """The foot stands at the trunk's place plus ``arm``, and is as uncertain as that."""
         here = FEET[side]
         self._x[here] = self._x[PLACE] + arm
-        sense = _end_of(arm)
+        sense = np.zeros((3, SIZE))
+        sense[:, PLACE] = UNIT
+        sense[:, TURN] = -pin.skew(arm)
         self._cov[here, :] = sense @ self._cov
         self._cov[:, here] = self._cov[here, :].T
         self._cov[here, here] = sense @ self._cov @ sense.T + self._leg
 
     def _correct(self, side: int, arm: np.ndarray) -> None:
         """The foot has not moved: what the leg says against where it should be."""
-        sense = -_end_of(arm)
-        sense[:, FEET[side]] = UNIT
+        sense = self._senses[side]
+        sense[:, TURN] = pin.skew(arm)
         missed = arm - (self._x[FEET[side]] - self._x[PLACE])
         seen = self._cov @ sense.T  # (SIZE, 3)
-        gain = np.linalg.solve(sense @ seen + self._leg, seen.T).T
+        # of a symmetric positive matrix; np.linalg.solve takes three times as long
+        gain = dposv(sense @ seen + self._leg, seen.T)[1].T
         error = gain @ missed
         self._cov -= gain @ seen.T
         self._cov = (self._cov + self._cov.T) / 2
         self._attitude = pin.exp3(error[TURN]) @ self._attitude
         self._x += error
-
-
-def _end_of(arm: np.ndarray) -> np.ndarray:
-    """Derivative (3, SIZE) by the error of the place of a point that is ``arm`` (3,) from the
-    trunk, world axes.
-    """
-    sense = np.zeros((3, SIZE))
-    sense[:, PLACE] = UNIT
-    sense[:, TURN] = -pin.skew(arm)
-    return sense

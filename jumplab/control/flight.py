@@ -78,7 +78,7 @@ class Flight:
         self._ground = ground
         self._q = tape.q[-1].copy()
         self._v = tape.v[-1].copy()
-        self._ahead, _, self._below = gauge.soles(self._q) - gauge.com(self._q)
+        self._ahead, _, self._below = (gauge.soles(self._q) - gauge.com(self._q)).tolist()
         flight = tape.flights[-1]
         q = tape.q[flight]
         self._t = tape.t[flight]
@@ -102,16 +102,16 @@ class Flight:
         """Time until the soles meet the ground [s] in a flight that is measured ``now``; inf if
         they never do.
         """
-        x, _, z = now.com
-        vx, _, vz = now.velocity
+        x, _, z = now.com.tolist()
+        vx, _, vz = now.velocity.tolist()
         left = 0.0
         for _ in range(2):  # the ground's height depends on where, and so on when
             drop = z + self._below - self._ground(x + vx * left + self._ahead)
             root = vz**2 + 2 * self._gravity * drop
             if root < 0:
                 return np.inf
-            left = (vz + np.sqrt(root)) / self._gravity
-        return float(left)
+            left = (vz + root**0.5) / self._gravity
+        return left
 
     def state(
         self, now: Motion, turn: np.ndarray, left_s: float, correction: np.ndarray | float = 0.0
@@ -181,12 +181,12 @@ class Flight:
         if left_s > STEP_S:
             middle, pace, dt = self.pieces(self._size, t, left_s, TURNS)
             rows = np.interp(middle, self._t, np.arange(len(self._t)))
-            for row, faster in zip(rows, pace, strict=True):
-                inertia = between(self._inertias, row)
+            ways = np.linalg.inv([between(self._inertias, row) for row in rows])
+            for row, faster, way in zip(rows, pace, ways, strict=True):
                 carried = faster * between(self._momenta, row)
                 halfway = attitude
                 for part in (dt / 2, dt):
-                    spin = np.linalg.solve(inertia, halfway.T @ now.momentum - carried)
+                    spin = way @ (now.momentum @ halfway - carried)
                     halfway = attitude @ pin.exp3(spin * part)
                 attitude = halfway
         return attitude @ rotation(self._q[3:7]).T

@@ -4,10 +4,12 @@ and soles.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial.transform import Rotation
 
 from jumplab.robot import Robot
 
@@ -19,14 +21,22 @@ class State(NamedTuple):
 
     q: np.ndarray  # (nq,) configuration
     v: np.ndarray  # (nv,) velocity
-    # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
-    wrench: np.ndarray
+    # what the feet feel, or a function that measures it once it is asked for
+    feet: np.ndarray | Callable[[], np.ndarray]
+
+    @property
+    def wrench(self) -> np.ndarray:
+        """(2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N
+        m].
+        """
+        return self.feet() if callable(self.feet) else self.feet
 
     def along(self, heading_rad: float) -> State:
         """The same, as seen along a heading."""
         if heading_rad == 0:
             return self
-        return State(headed(self.q, heading_rad), self.v, turned_wrench(self.wrench, heading_rad))
+        q = headed(self.q, heading_rad)
+        return State(q, self.v, lambda: turned_wrench(self.wrench, heading_rad))
 
 
 class Motion(NamedTuple):
@@ -42,6 +52,12 @@ class Motion(NamedTuple):
 def rotation(quaternion: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) of a quaternion (4,), x y z w."""
     return pin.Quaternion(np.asarray(quaternion, float)).toRotationMatrix()
+
+
+def rotations(quaternions: np.ndarray) -> np.ndarray:
+    """Rotations (..., 3, 3) of many quaternions (..., 4), x y z w."""
+    turns = Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix()
+    return turns.reshape(*quaternions.shape[:-1], 3, 3)
 
 
 def turned(q: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -135,5 +151,6 @@ class Gauge:
         """Motion of the whole robot in ``q`` (nq,) and ``v`` (nv,)."""
         data = self.data
         pin.ccrba(self.model, data, q, v)
-        velocity = data.hg.linear / self.robot.total_mass
-        return Motion(q, data.com[0].copy(), velocity, data.hg.angular.copy(), data.Ig.inertia)
+        momentum = data.hg
+        velocity = momentum.linear / self.robot.total_mass
+        return Motion(q, data.com[0].copy(), velocity, momentum.angular.copy(), data.Ig.inertia)

@@ -56,12 +56,7 @@ class Playback:
     """
 
     def __init__(self, tape: Tape, robot: Robot, lead_s: float = 0.0):
-        names = tuple(map(str, tape.joint_names))
-        if names != robot.joint_names:
-            raise InputError(
-                f"the tape's joints {', '.join(names[:3])} ... are not those of robot "
-                f"{robot.name}; plan the jump again with this robot"
-            )
+        check_tape(tape, robot)
         self.steps = round(float(tape.t[-1]) / STEP_S)
         self.lead = round(lead_s / STEP_S)
         self._gauge = Gauge(robot)
@@ -163,6 +158,16 @@ class Playback:
         return pin.integrate(self._gauge.model, q, np.concatenate([base, moved])), v + gained
 
 
+def check_tape(tape: Tape, robot: Robot) -> None:
+    """Refuse (:class:`InputError`) a tape of another robot's joints."""
+    names = tuple(map(str, tape.joint_names))
+    if names != robot.joint_names:
+        raise InputError(
+            f"the tape's joints {', '.join(names[:3])} ... are not those of robot "
+            f"{robot.name}; plan the jump again with this robot"
+        )
+
+
 def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Rows (n, ...) at times ``grid`` (n,) [s] of ``rows`` (N, ...) at times ``t`` (N,) [s]."""
     columns = [np.interp(grid, t, column) for column in rows.reshape(len(t), -1).T]
@@ -172,4 +177,5 @@ def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def between(rows: np.ndarray, at: float) -> np.ndarray:
     """The row (...) of ``rows`` (N, ...) at a place between two."""
     low = min(int(at), len(rows) - 2)
-    return rows[low] + min(at - low, 1.0) * (rows[low + 1] - rows[low])
+    share = min(at - low, 1.0)
+    return rows[low] + share * (rows[low + 1] - rows[low]) if share else rows[low]

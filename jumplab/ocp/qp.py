@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from proxsuite import proxqp
@@ -38,8 +38,7 @@ NO_LIMIT = 1e20  # from which on HiGHS takes a side of a row for none
 NUMBERS = tuple(map(str, range(1000)))  # labels of rows that have none
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """Rows (m, n) of one name between ``low`` (m,) and ``high`` (m,), each with a label.
 
     Costs have weights (m,), and their target is both ``low`` and ``high``; ``weight`` is None for
@@ -106,7 +105,8 @@ class Qp:
         self.limits[name] = self._block(name, matrix, low, high, None, labels)
 
     def _block(self, name, matrix, low, high, weight, labels) -> Block:
-        matrix = np.atleast_2d(np.asarray(matrix, float))
+        matrix = np.asarray(matrix, float)
+        matrix = matrix if matrix.ndim == 2 else np.atleast_2d(matrix)
         size = len(matrix)
         labels = tuple(labels) or NUMBERS[:size]
         below = _column(low, size)

@@ -18,7 +18,6 @@ from jumplab.sim import STEP_S
 
 # share of its rate that friction may take from a joint within a step: it must not turn it back
 STOPPING = 0.5
-LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Armature:
@@ -32,45 +31,44 @@ class Armature:
         self._data = model.createData()
         self._armature = robot.limits.armature
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._motors = []
-        self._joints = {}  # of links
-        self.lent = {}
         links = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
         first = {frame.parentJoint: frame.name for frame in links[::-1]}  # of each joint's body
-        for name, armature in zip(robot.joint_names, self._armature, strict=True):
-            if armature:
-                here = model.getJointId(name)
-                column = model.idx_vs[here]
-                slope = pin.computeJointJacobian(model, self._data, pin.neutral(model), here)
-                bodies = {first[body]: body for body in (here, model.parents[here])}
-                self._joints |= bodies
-                for link in bodies:
-                    self.lent[link] = self.lent.get(link, 0.0) + armature
-                self._motors.append((*bodies, armature * slope[3:, column], column))
-        # views of Pinocchio's own numbers, which are new after each of its passes
-        self._turns = {link: self._data.oMi[joint].rotation for link, joint in self._joints.items()}
-        self._twists = [twist.angular for twist in self._data.v]
+        self.lent: dict[str, float] = {}
+        self._lent = np.zeros((model.njoints, 1))  # by body
+        # which bodies move with each entry of v
+        self._carries = np.ones((model.nv, model.njoints))
+        for k, name in enumerate(robot.joint_names):
+            here = model.getJointId(name)
+            self._carries[6 + k] = np.isin(range(model.njoints), list(model.subtrees[here]))
+            for body in (here, model.parents[here]) if self._armature[k] else ():
+                self._lent[body] += self._armature[k]
+                self.lent[first[body]] = float(self._lent[body, 0])
 
-    def returned(self, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-        """Torque (3,) for each link, world axes, in the step that begins at ``q`` (nq,) and ``v``
-        (nv,) [N m]; to be called once for each step."""
-        now = self._spins(q, v), v
-        change, rate = ((x - y) / STEP_S for x, y in zip(now, self._last or now, strict=True))
+    def returned(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Generalised forces (nv,) in the step that begins at ``q`` (nq,) and ``v`` (nv,): moments
+        in the base's axes and torques [N m]; to be called once for each step.
+        """
+        axes = self._axes(q)
+        now = self._spins(axes, v), v[6:]
+        changes = ((x - y) / STEP_S for x, y in zip(now, self._last or now, strict=True))
         self._last = now
-        turns = self._turns
-        out = {
-            link: turns[link] @ (self.lent[link] * change[k]) for link, k in self._joints.items()
-        }
-        for child, parent, along, column in self._motors:
-            torque = turns[child] @ along * rate[column]
-            out[child] -= torque
-            out[parent] += torque
-        return out
+        return self._forces(axes, *changes)
 
-    def _spins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Angular velocities (joints, 3) of all bodies in their joints' axes."""
-        pin.forwardKinematics(self._model, self._data, q, v)
-        return np.array(self._twists)
+    def _axes(self, q: np.ndarray) -> np.ndarray:
+        """Axes (nv, 3) about which each entry of the velocity turns bodies, in the world's."""
+        return pin.computeJointJacobians(self._model, self._data, q)[3:].T
+
+    def _spins(self, axes: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Angular velocities (bodies, 3) in the world's axes."""
+        return self._carries.T @ (axes * v[:, None])
+
+    def _forces(self, axes: np.ndarray, change: np.ndarray, rate: np.ndarray) -> np.ndarray:
+        """Generalised forces (nv,) of the links' lent inertia where their spins ``change``
+        (bodies, 3), less those of the rotors at the ``rate`` (nv - 6,) of the joints' speeds.
+        """
+        out = (axes * (self._carries @ (self._lent * change))).sum(axis=1)
+        out[6:] -= self._armature * rate
+        return out
 
     def late(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Generalised forces (N - 1, nv) that acted because of the delay, from a log (N, nq), (N,
@@ -79,17 +77,11 @@ class Armature:
         The torque given back in a step, less the one due in it: summed over any time, this is the
         difference of those due at its two ends.
         """
-        spins = np.array([self._spins(*row) for row in zip(q, v, strict=True)])
+        axes = [self._axes(row) for row in q]
+        spins = np.array([self._spins(*row) for row in zip(axes, v, strict=True)])
         changes = (np.diff(x, axis=0) / STEP_S for x in (spins, v[:, 6:]))
-        late, rate = (-np.diff(x, axis=0, prepend=np.zeros_like(x[:1])) for x in changes)
-        out = np.zeros((len(late), self._model.nv))
-        out[:, 6:] = -self._armature * rate
-        for k, row in enumerate(late):
-            pin.computeJointJacobians(self._model, self._data, q[k])
-            for link, joint in self._joints.items():
-                slope = pin.getJointJacobian(self._model, self._data, joint, LOCAL)[3:]
-                out[k] += self.lent[link] * slope.T @ row[joint]
-        return out
+        late = (-np.diff(x, axis=0, prepend=np.zeros_like(x[:1])) for x in changes)
+        return np.array([self._forces(*row) for row in zip(axes[:-1], *late, strict=True)])
 
 
 class Friction:

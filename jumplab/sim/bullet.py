@@ -17,12 +17,12 @@ from typing import Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from jumplab.control.kinematics import rotation
+from jumplab.control.kinematics import rotation, rotations
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.armature import Armature, Friction
-from jumplab.sim.engine import Engine, Kept, inertial, moment
-from jumplab.sim.scene import REACH_M, Contacts
+from jumplab.sim.engine import Engine, Kept, inertial, moments
+from jumplab.sim.scene import REACH_M
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class Contact:
 HARD = Contact({"numSolverIterations": 1000, "contactERP": 0.1, "contactSlop": 1e-4})
 # friction combines as a product: the robot's coefficient is the effective one
 GROUND_FRICTION = 1.0
+NOTHING = np.zeros((0, 16))  # what is noted of points on which ground presses, where it does not
+NOWHERE = np.tile(np.eye(7)[6], (2, 1))  # places and attitudes of the feet, where nothing presses
 FASTEST = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
 
 
@@ -124,10 +126,9 @@ def base_from_bullet(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
     attitude = rotation(quaternion)
-    local_rate = attitude.T @ rate
-    local_velocity = attitude.T @ velocity - pin.skew(local_rate) @ lever
-    q = np.concatenate([position - attitude @ lever, quaternion])
-    return q, np.concatenate([local_velocity, local_rate])
+    arm = attitude @ lever
+    twist = np.array([velocity - moments(rate, arm), rate]) @ attitude
+    return np.concatenate([position - arm, quaternion]), twist.ravel()
 
 
 class BulletEngine(Engine):
@@ -214,7 +215,6 @@ class BulletEngine(Engine):
             change(link, localInertiaDiagonal=[x + self._armature.lent[name] for x in inertia])
 
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
-        self._now: tuple[np.ndarray, np.ndarray] | None = None
         self._friction = Friction(self.robot, q)
         self._torque = np.zeros(len(self._joints))
         position, quaternion, velocity, rate = base_to_bullet(q, v, self._lever)
@@ -253,21 +253,13 @@ class BulletEngine(Engine):
             gravity=[world[f"gravityAcceleration{axis}"] for axis in "XYZ"],
         )
 
-    def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""
-        if self._now is None:
-            self._now = self._read()
-        q, v = self._now
-        return q.copy(), v.copy()
-
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
         pose = self._bullet.getBasePositionAndOrientation(self._body)
         twist = self._bullet.getBaseVelocity(self._body)
-        base_q, base_v = base_from_bullet(*(np.array(x) for x in (*pose, *twist)), self._lever)
-        joints = np.array(
-            [row[:2] for row in self._bullet.getJointStates(self._body, self._joints)]
-        )
-        return np.concatenate([base_q, joints[:, 0]]), np.concatenate([base_v, joints[:, 1]])
+        base_q, base_v = base_from_bullet(*map(np.array, (*pose, *twist)), self._lever)
+        rows = self._bullet.getJointStates(self._body, self._joints)
+        angles, rates = np.array([row[:2] for row in rows]).T
+        return np.concatenate([base_q, angles]), np.concatenate([base_v, rates])
 
     def set_torque(self, tau: np.ndarray) -> None:
         """Torque of every joint for the next step [N m]."""
@@ -281,55 +273,77 @@ class BulletEngine(Engine):
         point = np.array(origin) + rotation(turn) @ (place - self._lever)
         self._bullet.applyExternalForce(self._body, -1, force, point, bullet.WORLD_FRAME)
 
-    def step(self) -> None:
-        """Advance by :data:`jumplab.sim.STEP_S`, with armature and friction of the motors."""
+    def _advance(self) -> None:
         tau = self._torque
         if self.robot.limits.lossy or self._lent:
             q, v = self.state()
             tau = tau - self._friction.torque(v[6:])
             returned = self._armature.returned(q, v)
-            for link, name in self._lent:
-                self._bullet.applyExternalTorque(
-                    self._body, link, returned[name], bullet.WORLD_FRAME
-                )
+            tau += returned[6:]
+            moment = rotation(q[3:7]) @ returned[3:6]
+            self._bullet.applyExternalTorque(self._body, -1, moment, bullet.WORLD_FRAME)
         self._bullet.setJointMotorControlArray(
             self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau
         )
         self._bullet.stepSimulation()
-        self._now = None
+        self._note()
 
     def applied(self) -> np.ndarray:
         """Torque that the motors gave in the last step (nv - 6,) [N m], as they were told: PyBullet
         reports those of its own only."""
         return self._torque
 
-    def contacts(self) -> Contacts:
-        """Ground forces on the feet and all touching links, from the last step."""
-        wrench = np.zeros((2, 6))
-        touching = set()
+    def _note(self) -> None:
+        """Note all points on which ground presses, and where the feet are."""
+        points = []
         colliding = False
-        feet = {foot: [] for foot in self._feet}
         for row in self._bullet.getContactPoints(bodyA=self._body):
-            _, _, other, link, _, place, _, normal, _, pressure, *friction = row
+            _, _, other, link, _, place, _, normal, _, *forces = row
+            pressure, first, along, second, across = forces
             if pressure <= 0:
                 continue
             if other == self._body:
                 colliding = True
                 continue
-            touching.add(self.links[link + 1])
-            if link in feet:
-                first, along, second, across = friction
-                sizes = [pressure, first, second]
-                feet[link].append([place, np.dot(sizes, [normal, along, across])])
-        for (foot, presses), on_foot in zip(feet.items(), wrench, strict=True):
-            if presses:
-                place, force = np.array(presses).swapaxes(0, 1)
-                origin, turn = self._bullet.getLinkState(self._body, foot)[4:6]
-                arm = place - origin
-                on_foot[:3] = force.sum(axis=0)
-                on_foot[3:] = moment(arm, force)
-                self._pressed.append((arm @ rotation(turn),))
-        return Contacts(wrench, frozenset(touching), colliding)
+            points.append((link, pressure, first, second, *place, *normal, *along, *across))
+        self.fallen = any(point[0] not in self._feet for point in points)
+        feet = NOWHERE
+        if points:
+            states = [self._bullet.getLinkState(self._body, foot) for foot in self._feet]
+            feet = np.array([(*state[4], *state[5]) for state in states])
+        self._notes.append((np.array(points) if points else NOTHING, colliding, feet))
+
+    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
+        step, link, arm, force, _ = self._presses(notes)
+        wrench = np.zeros((len(notes), 2, 6))
+        pushes = np.hstack([force, moments(arm, force)])
+        for side, foot in enumerate(self._feet):
+            on_it = link == foot
+            np.add.at(wrench[:, side], step[on_it], pushes[on_it])
+        return wrench
+
+    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
+        step, link, *_ = self._presses(notes)
+        touching = np.zeros((len(notes), len(self.links)), bool)
+        touching[step, link + 1] = True
+        return touching, np.array([note[1] for note in notes])
+
+    def _presses(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, ...]:
+        """Of all k points that were noted: step, link, place (k, 3) from the foot, force (k, 3) and
+        the foot's attitude (k, 4); the right foot's where the link is none.
+        """
+        points, _, feet = zip(*notes, strict=True)
+        step = np.repeat(np.arange(len(notes)), [len(x) for x in points])
+        points = np.concatenate(points)
+        link = points[:, 0].astype(int)
+        foot = np.array(feet)[step, (link != self._feet[0]).astype(int)]
+        axes = points[:, 7:].reshape(-1, 3, 3)
+        force = (points[:, None, 1:4] @ axes)[:, 0]
+        return step, link, points[:, 4:7] - foot[:, :3], force, foot[:, 3:]
 
     def _sole_points(self) -> np.ndarray:
-        return np.concatenate([points for (points,) in self._pressed])
+        if not self._notes:
+            return np.zeros((0, 3))
+        _, link, arm, _, attitude = self._presses(self._notes)
+        there = (arm[:, None] @ rotations(attitude))[:, 0]
+        return there[np.isin(link, self._feet)]

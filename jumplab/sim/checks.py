@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from jumplab.control.kinematics import Gauge, rotation
+from jumplab.control.kinematics import Gauge, rotation, rotations
 from jumplab.robot.contact import on_feet
 from jumplab.robot.description import Foot
 from jumplab.robot.legs import size
@@ -149,16 +149,16 @@ def unexplained(result: SimulationResult) -> tuple[np.ndarray, np.ndarray]:
     states = _steps(result)
     left = np.empty_like(states[2])
     pushes, place = _pushes(result)
+    loaded = result.foot_wrench.any(axis=-1).tolist()
     for k, (q, v, a) in enumerate(zip(*states, strict=True)):
         left[k] = pin.rnea(model, data, q, v, a)
-        pin.computeJointJacobians(model, data, q)
-        for at, wrench in zip(feet, result.foot_wrench[k], strict=True):
-            if wrench.any():
-                slope = at.slope(model, data)
-                left[k] -= slope.T @ wrench
-        if pushes[k].any():
-            force = rotation(q[3:7]).T @ pushes[k]
-            left[k, :6] -= [*force, *np.cross(place, force)]
+        if any(loaded[k]):
+            pin.computeJointJacobians(model, data, q)
+            for at, wrench in zip(feet, result.foot_wrench[k], strict=True):
+                left[k] -= wrench @ at.slope(model, data)
+    for k in np.flatnonzero(pushes[:-1].any(axis=1)):
+        force = rotation(states[0][k, 3:7]).T @ pushes[k]
+        left[k, :6] -= [*force, *np.cross(place, force)]
     if engine["substeps"] > 1:
         left[:, :6] = _momentum_unexplained(result)
     left[:, 6:] -= result.tau[:-1]
@@ -199,7 +199,7 @@ def _momentum_unexplained(result: SimulationResult) -> np.ndarray:
     linear = robot.total_mass * velocity
     spin = spin + np.cross(com, linear)
     pushes, arm = _pushes(result)
-    pushed = [q[:3] + rotation(q[3:7]) @ arm for q in result.q]
+    pushed = result.q[:, :3] + rotations(result.q[:, 3:7]) @ arm
     forces = result.foot_wrench[:, :, :3]
     turned = result.foot_wrench[:, :, 3:] + np.cross(result.feet[:, :, :3, 3], forces)
     moments = np.cross(pushed, pushes) + turned.sum(axis=1)
@@ -225,7 +225,7 @@ def _steps(result: SimulationResult) -> tuple[np.ndarray, np.ndarray, np.ndarray
     arm = model.inertias[1].lever * engine.get("keeps_com", True)
     pairs = zip(result.q[:-1], result.q[1:], strict=True)
     q = np.array([pin.interpolate(model, *pair, share) for pair in pairs])
-    turns, turn = (np.array([rotation(row[3:7]) for row in x]) for x in (result.q, q))
+    turns, turn = (rotations(x[:, 3:7]) for x in (result.q, q))
     spins = result.v[:, 3:6]
     # of the base's CoM, in world axes; then within the step, in base axes
     twists = np.stack([spins, result.v[:, :3] + np.cross(spins, arm)])

@@ -25,7 +25,24 @@ from jumplab.sim.scene import Contacts, Scene
 MASS_KG = 1e-6
 ROUNDING = 1e-9
 SOLE_POINTS = 8  # contact points of two flat rectangular soles
+NEXT, LAST = [1, 2, 0], [2, 0, 1]  # axes
 TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
+
+
+class Log(NamedTuple):
+    """Steps of a run, a row each: the state before it, and what acted in it."""
+
+    q: np.ndarray  # (n, nq)
+    v: np.ndarray  # (n, nv)
+    tau: np.ndarray  # (n, nv - 6) of the motors [N m]
+    # (n, 2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
+    wrench: np.ndarray
+    touching: np.ndarray  # (n, links) which links press on the ground
+    colliding: np.ndarray  # (n,) whether links of the robot press on each other
+
+    def some(self, rows: slice) -> Log:
+        """Some rows of it."""
+        return Log(*(column[rows] for column in self))
 
 
 class Kept(NamedTuple):
@@ -71,6 +88,7 @@ class Engine(ABC):
     # whether it has no armature, and that of motors comes by :class:`.armature.Armature`
     late_armature: bool = False
     links: tuple[str, ...]  # names of the robot's links, the base first
+    fallen: bool  # whether a link that is no foot touched the ground in the last step
 
     def __init__(
         self,
@@ -86,8 +104,11 @@ class Engine(ABC):
         self._contact_name = contact if isinstance(contact, str) else str(contact)
         self.scene = scene or Scene.flat()
         self.contact = self.contact_of(contact, self.scene)
-        # where ground has pressed on feet: what each step noted for :meth:`_sole_points`
-        self._pressed: list[tuple[np.ndarray, ...]] = []
+        self._now: tuple[np.ndarray, np.ndarray] | None = None
+        # of each step: state before it and torque in it; and what the engine notes of its contacts
+        self._steps: list[tuple[np.ndarray, ...]] = []
+        self._notes: list[tuple[Any, ...]] = []
+        self.fallen = False
         try:
             self._build(friction)
             self._compare(friction)
@@ -143,9 +164,16 @@ class Engine(ABC):
     def kept(self) -> Kept:
         """Quantities that the engine really has."""
 
-    @abstractmethod
     def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """True configuration (nq,) and velocity (nv,)."""
+        """True configuration (nq,) and velocity (nv,), in Pinocchio's conventions."""
+        if self._now is None:
+            self._now = self._read()
+        q, v = self._now
+        return q.copy(), v.copy()
+
+    @abstractmethod
+    def _read(self) -> tuple[np.ndarray, np.ndarray]:
+        """The state, as the engine has it now."""
 
     @abstractmethod
     def set_torque(self, tau: np.ndarray) -> None:
@@ -161,19 +189,50 @@ class Engine(ABC):
         frame [N, m].
         """
 
-    @abstractmethod
     def step(self) -> None:
-        """Advance by :data:`jumplab.sim.STEP_S`."""
+        """Advance by :data:`jumplab.sim.STEP_S`, with armature and friction of the motors."""
+        state = self.state()
+        self._advance()
+        self._now = None
+        self._steps.append((*state, self.applied()))
 
     @abstractmethod
-    def contacts(self) -> Contacts:
-        """Contacts of the last step, and their forces."""
+    def _advance(self) -> None:
+        """Take a step, append to ``_notes`` what the next two need of it, and set ``fallen``:
+        whether a link that is no foot touched the ground.
+        """
+
+    @abstractmethod
+    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
+        """Wrenches on the feet (n, 2, 6) in n steps that were noted."""
+
+    @abstractmethod
+    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
+        """Which links touched the ground (n, links), and whether links touched each other (n,)."""
 
     @abstractmethod
     def _sole_points(self) -> np.ndarray:
-        """Places (k, 3) in the feet's frames where ground has pressed on them so far, from what
-        was noted; at least one step has noted something.
+        """Places (k, 3) in the feet's frames where ground has pressed on them so far."""
+
+    def wrench(self) -> np.ndarray:
+        """Force and moment of the ground on each foot in the last step (2, 6), world axes, at the
+        origin of the foot link [N, N m].
         """
+        return self._wrenches(self._notes[-1:])[0] if self._notes else np.zeros((2, 6))
+
+    def contacts(self) -> Contacts:
+        """Contacts of the last step, and their forces."""
+        if not self._notes:
+            return Contacts(self.wrench(), frozenset(), False)
+        touching, colliding = (x[0] for x in self._touched(self._notes[-1:]))
+        links = frozenset(self.links[k] for k in np.flatnonzero(touching))
+        return Contacts(self.wrench(), links, bool(colliding))
+
+    def log(self) -> Log:
+        """All steps so far."""
+        notes = self._notes
+        columns = map(np.array, zip(*self._steps, strict=True))
+        return Log(*columns, self._wrenches(notes), *self._touched(notes))
 
     def spring(self, soft_m: float) -> tuple[float, float]:
         """Stiffness [N/m] and damping [N s/m] of one contact point of ground into which flat soles,
@@ -228,20 +287,17 @@ class Engine(ABC):
 
     def _beyond_sole(self) -> float:
         """Largest distance beyond the stated sole at which a contact of a foot ever lay [m]."""
-        if not self._pressed:
-            return 0.0
         foot = self.robot.foot
         x, y, _ = self._sole_points().T
         side = np.abs(y - foot.center[1]) - foot.half_width
         return float(np.max([foot.heel - x, x - foot.toe, side], initial=0.0))
 
 
-def moment(arms: np.ndarray, forces: np.ndarray) -> np.ndarray:
-    """Sum (3,) of the moments of ``forces`` (k, 3) at ``arms`` (k, 3); np.cross takes five times as
+def moments(arms: np.ndarray, forces: np.ndarray) -> np.ndarray:
+    """Moments (..., 3) of ``forces`` (..., 3) at ``arms`` (..., 3); np.cross takes three times as
     long.
     """
-    spread = arms.T @ forces
-    return (spread - spread.T)[[1, 2, 0], [2, 0, 1]]
+    return arms[..., NEXT] * forces[..., LAST] - arms[..., LAST] * forces[..., NEXT]
 
 
 def inertial(

@@ -4,6 +4,7 @@ nothing is reset.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -25,7 +26,7 @@ from jumplab.sim.checks import check
 from jumplab.sim.engine import engine_class
 from jumplab.sim.motors import Motors
 from jumplab.sim.perturbation import Perturbation
-from jumplab.sim.result import BOTH, Row, SimulationResult, record
+from jumplab.sim.result import BOTH, SimulationResult, record
 from jumplab.sim.scene import Scene
 from jumplab.sim.sensors import Perception
 
@@ -39,7 +40,7 @@ class Run:
     """One run: ``robot`` as planned, perturbed as it really is (``real``), on a ground, in one of
     the engines.
 
-    A controller may know its ``hardware``; ``rows`` is the log, as of :func:`.result.record`.
+    A controller may know its ``hardware``; the ``log`` is there once it was played.
     """
 
     def __init__(
@@ -64,7 +65,6 @@ class Run:
             force_noise_n=self.perturbation.noise.force,
             substeps=kind.contact_of(contact, self.ground).substeps,
         )
-        self.rows: list[Row] = []
 
     def play(
         self,
@@ -84,29 +84,26 @@ class Run:
         perceive = Perception(self.robot, q, v, differs.noise, differs.seed)
         motors = Motors(self.real, differs.motor_gain, differs.sag_per_kw)
         delay = round(differs.delay_s / STEP_S)
-        sent: list[Drive] = []
+        sent: deque[Drive] = deque(maxlen=delay + 1)
         self.push_place = self.robot.model.inertias[1].lever.copy()
         self._begun = step
-        feet = frozenset(self.robot.foot.frames)
         fallen = 0
         with self._open(self.real, q, v, scene=self.ground, friction=differs.friction) as engine:
-            contacts = engine.contacts()
             while not over(step, fallen * STEP_S):
                 if step % TOLD == 0:
                     tell(f"simulated {step * STEP_S:.1f} s")
                 q, v = engine.state()
-                state = perceive(State(q, v, contacts.wrench))
+                state = perceive(State(q, v, engine.wrench))
                 sent.append(drive(step * STEP_S, state))
-                arriving = sent[max(len(sent) - 1 - delay, 0)].torque(state.q[7:], state.v[6:])
+                arriving = sent[0].torque(state.q[7:], state.v[6:])
                 engine.set_torque(motors.deliver(arriving, v[6:]))
                 for push in self.pushes:
                     if push.at(step):
                         engine.push(np.array(push.force_n), self.push_place)
                 engine.step()
-                contacts = engine.contacts()
-                self.rows.append((q, v, engine.applied(), contacts))
-                fallen += bool(fallen or contacts.touching - feet)
+                fallen += bool(fallen or engine.fallen)
                 step += 1
+            self.log = engine.log()
             self.links = engine.links
             self.engine = engine.read_back()
             self.perception = perceive.to_json()
@@ -145,7 +142,7 @@ class Run:
         higher_m = self.ground.height_of(goal, self.robot, self.scene)
         result = record(
             self.real,
-            self.rows[rows],
+            self.log.some(rows),
             self.links,
             goal,
             higher_m=higher_m,

@@ -30,5 +30,6 @@ class Motors:
         left = max(1 - self._sag_per_w * self._drawn_w, LEAST_VOLTAGE)
         low, high = self._limits.range(rate / left)
         given = np.minimum(np.maximum(self._gain * tau, low), high)
-        self._drawn_w = float(np.maximum(given * rate, 0.0).sum())
+        if self._sag_per_w:
+            self._drawn_w = float(np.maximum(given * rate, 0.0).sum())
         return given

@@ -12,8 +12,8 @@ import numpy as np
 from jumplab.control.kinematics import rotation
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
-from jumplab.sim.engine import Engine, Kept, inertial, moment
-from jumplab.sim.scene import REACH_M, Contacts, Scene
+from jumplab.sim.engine import Engine, Kept, inertial, moments
+from jumplab.sim.scene import REACH_M, Scene
 
 # MuJoCo would write its warnings into a file of the working folder
 mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
@@ -87,7 +87,7 @@ class MujocoEngine(Engine):
         return found
 
     def _build(self, friction: float) -> None:
-        spec = self._read()
+        spec = self._spec()
         contact = self.contact
         option = spec.option
         option.timestep = STEP_S / contact.substeps
@@ -154,7 +154,7 @@ class MujocoEngine(Engine):
                 model.geom_friction[geom, 0] = friction
                 model.opt.impratio = SOFT_CONE_RATIO
 
-    def _read(self) -> mujoco.MjSpec:
+    def _spec(self) -> mujoco.MjSpec:
         """The robot's URDF, its base free, every link kept, none of its pictures."""
         try:
             spec = mujoco.MjSpec.from_string(self.robot.urdf)
@@ -185,8 +185,11 @@ class MujocoEngine(Engine):
             getattr(model, there)[self._v[6:]] = getattr(self._motors, key)
         self._feet = np.array([model.body(name).id for name in self.robot.foot.frames])
         self._torque = np.zeros(len(joints))
-        self._felt = np.zeros((1, self._model.nsensordata))
-        self._origins = np.zeros((2, 3))
+        # of the contact sensors in a step: all of them, those of the feet, forces on other links
+        self._felt = np.zeros((self.contact.substeps, model.nsensordata))
+        columns = 3 + np.arange(9 * len(self.links)).reshape(-1, 3, 3)
+        self._on_feet = columns[self._feet - 1]
+        self._stray = np.delete(columns, self._feet - 1, axis=0)[:, 0].ravel()
 
     def close(self) -> None:
         """Free the engine."""
@@ -234,8 +237,7 @@ class MujocoEngine(Engine):
         larger = np.maximum(friction[ground], friction[geom])
         return np.where(rank[ground] == rank[geom], larger, ranked)
 
-    def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""
+    def _read(self) -> tuple[np.ndarray, np.ndarray]:
         q = self._data.qpos[self._q]
         v = self._data.qvel[self._v]
         v[:3] = rotation(q[3:7]).T @ v[:3]
@@ -257,40 +259,41 @@ class MujocoEngine(Engine):
         """Torque (nv - 6,) that acted in the last step [N m]."""
         return self._torque
 
-    def step(self) -> None:
-        """Advance by :data:`jumplab.sim.STEP_S`."""
-        felt = []
-        for substep in range(self.contact.substeps):
-            mujoco.mj_step(self._model, self._data)
-            if substep == 0:
-                self._origins = self._data.xpos[self._feet]
-            felt.append(self._data.sensordata.copy())
-        self._felt = np.array(felt)
-        self._torque = self._data.qfrc_applied[self._v[6:]]
-        self._data.xfrc_applied[1] = 0.0
-
-    def contacts(self) -> Contacts:
-        """Mean forces of the ground on the feet, and all that touched, in the last step; moments
-        are about where the feet were before it."""
-        wrench = np.zeros((2, 6))
-        if not self._felt.any():
-            return Contacts(wrench, frozenset(), False)
-        # by the engine's step and link: force and moment of the link on the ground, and where
-        ground = self._felt[:, 3:].reshape(-1, len(self.links), 3, 3)
-        for foot, origin, on_foot in zip(self._feet, self._origins, wrench, strict=True):
-            force, turning, place = ground[:, foot - 1].swapaxes(0, 1)
-            on_foot[:3] = -force.sum(axis=0) / len(ground)
-            on_foot[3:] = -(turning.sum(axis=0) + moment(place - origin, force)) / len(ground)
+    def _advance(self) -> None:
         data = self._data
+        for substep in range(self.contact.substeps):
+            mujoco.mj_step(self._model, data)
+            if substep == 0:
+                origins = data.xpos[self._feet]
+            self._felt[substep] = data.sensordata
+        self._torque = data.qfrc_applied[self._v[6:]]
+        data.xfrc_applied[1] = 0.0
+        felt = self._felt.any(axis=0)
+        self.fallen = bool(felt[self._stray].any())
         has = data.contact
-        noted = has.geom, has.pos, has.frame, has.dist, data.xpos, data.xmat
-        self._pressed.append(tuple(x.copy() for x in noted))
-        touching = np.flatnonzero(ground[:, :, 0].any(axis=(0, 2)))
-        colliding = bool(self._felt[:, :3].any())
-        return Contacts(wrench, frozenset(self.links[k] for k in touching), colliding)
+        places = has.geom, has.pos, has.frame, has.dist, data.xpos, data.xmat
+        note = self._felt[:, self._on_feet], origins, felt
+        self._notes.append((*note, *(x.copy() for x in places)))
+
+    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
+        """Forces are means over a step; moments are about where the feet were before it."""
+        on_feet, origins = (np.array([note[k] for note in notes]) for k in range(2))
+        # by step, the engine's own one and foot: force and moment on the ground, and where they act
+        force = on_feet[..., 0, :]
+        total = on_feet[..., :2, :].sum(axis=1)
+        total[..., 1, :] += moments(on_feet[..., 2, :] - origins[:, None], force).sum(axis=1)
+        return (total / -on_feet.shape[1]).reshape(-1, 2, 6)
+
+    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
+        felt = np.array([note[2] for note in notes])
+        forces = felt[:, 3:].reshape(len(felt), -1, 3, 3)[:, :, 0]
+        return forces.any(axis=-1), felt[:, :3].any(axis=-1)
 
     def _sole_points(self) -> np.ndarray:
-        *contacts, xpos, xmat = zip(*self._pressed, strict=True)
+        touched = [note[3:] for note in self._notes if len(note[3])]
+        if not touched:
+            return np.zeros((0, 3))
+        *contacts, xpos, xmat = zip(*touched, strict=True)
         geoms, place, frame, depth = map(np.concatenate, contacts)
         step = np.repeat(np.arange(len(xpos)), [len(x) for x in contacts[0]])
         pairs = self._model.geom_bodyid[geoms]

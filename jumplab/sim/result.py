@@ -24,7 +24,7 @@ from jumplab.io.motion import CONTACT_FORCE_N, SIMULATION_NAME, SIMULATION_SCHEM
 from jumplab.robot import Robot
 from jumplab.robot.motors import MotorLimits
 from jumplab.sim import STEP_S
-from jumplab.sim.scene import Contacts
+from jumplab.sim.engine import Log
 
 STILL_SPEED = 0.05  # [m/s] a CoM slower than this at the end stands
 LEVEL_TOLERANCE_M = 0.05  # soles this close to the planned height stand on the planned surface
@@ -269,12 +269,9 @@ def checks_named(report: dict) -> dict:
     return {OLD_NAMES.get(name, name): value for name, value in report.items()}
 
 
-Row = tuple[np.ndarray, np.ndarray, np.ndarray, Contacts]
-
-
 def record(
     robot: Robot,
-    rows: Sequence[Row],
+    steps: Log,
     links: tuple[str, ...],
     goal: np.ndarray,
     *,
@@ -286,17 +283,14 @@ def record(
 ) -> SimulationResult:
     """The finished record of a run of ``robot`` as it really is, whose ``links`` are named.
 
-    ``rows`` are of each step (nq,) and (nv,) before it, the motors' torques (nv - 6,) in it [N m],
-    and what touched in it; ``goal`` (nq,) is how the tape ends, where the ground is really
-    ``higher_m`` higher [m], after so many ``flights``, of which the last one ends on the feet
-    ``lands`` (0 left, 1 right); ``solves`` are QPs posed and failed. Raises :class:`SolverError`
-    if the engine's numbers have exploded.
+    ``steps`` are those of the engine; ``goal`` (nq,) is how the tape ends, where the ground is
+    really ``higher_m`` higher [m], after so many ``flights``, of which the last one ends on the
+    feet ``lands`` (0 left, 1 right); ``solves`` are QPs posed and failed. Raises
+    :class:`SolverError` if the engine's numbers have exploded.
     """
-    *columns, contacts = zip(*rows, strict=True)
-    q, v, tau = map(np.array, columns)
+    q, v, tau, wrench, touching, colliding = steps
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise SolverError("the engine lost the robot: its state is not finite", stage="simulation")
-    wrench = np.array([c.wrench for c in contacts])
     gauge = Gauge(robot)
     flown = events(wrench[:, :, 2].sum(axis=1), lambda row: gauge.toe(q[row]), flights)
     phase = np.full(len(q), "launch", dtype="<U7")
@@ -316,8 +310,8 @@ def record(
         com_velocity=np.array(velocity),
         L=np.array(momentum)[:, 1],
         rho=np.array(inertia)[:, 1, 1],
-        touching=np.array([[name in c.touching for name in links] for c in contacts]),
-        colliding=np.array([c.colliding for c in contacts]),
+        touching=touching,
+        colliding=colliding,
     )
     for array in log.values():
         array.setflags(write=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -56,7 +57,7 @@ class Block:
     pivot_m: float = 0.0
     soft_m: float = 0.0  # how deep the weight presses flat soles into it
 
-    @property
+    @cached_property
     def turn(self) -> np.ndarray:
         """(3, 3) how it is turned."""
         return pin.rpy.rpyToMatrix(self.roll_rad, self.pitch_rad, 0.0)
@@ -187,7 +188,9 @@ class Scene:
 
     def top_at(self, x: float, y: float = 0.0) -> float:
         """Height of the highest surface at ``x``, and ``y`` to the left of the jump [m]."""
-        return float(self._highest(np.array([x, y]))[1])
+        here = [b for b in self.blocks if b.x_from <= x <= b.x_to and b.y_from <= y <= b.y_to]
+        tops = [b.top if b.even else b.height_at(x, y) for b in here]
+        return float(max(tops, default=NOTHING.top))
 
     def _highest(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of the highest block at ``places`` (..., 2) along the jump and to its left [m]: its

@@ -6,12 +6,13 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.control.estimator import Estimator, Reading, SensorNoise
-from jumplab.control.kinematics import State, rotation, turned
+from jumplab.control.kinematics import State, rotation, rotations, turned
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.task import GRAVITY
 
 LEVER_M = 0.05  # a moment of a foot's sensor is wrong by as much as a force at this distance
+LEVERS = np.repeat([1.0, LEVER_M], 3)
 
 
 class Sensors:
@@ -41,28 +42,27 @@ class Sensors:
         per step.
         """
         n = self.noise
-        draw = self._rng.standard_normal
+        joints = len(v) - 6
+        # in this order: angles, rates, gyro, accelerometer, forces
+        errors = self._rng.standard_normal(2 * joints + 8)
         attitude = rotation(q[3:7])
         velocity = attitude @ v[:3]
         gained = np.zeros(3) if self._last_velocity is None else velocity - self._last_velocity
         self._last_velocity = velocity
         force = attitude.T @ (gained / STEP_S - self._gravity)
-        joints = q[7:] + n.joint_rad * draw(len(q) - 7)
+        angles = q[7:] + n.joint_rad * errors[:joints]
         if n.encoder_step_rad:
-            joints = n.encoder_step_rad * np.round(joints / n.encoder_step_rad)
+            angles = n.encoder_step_rad * np.round(angles / n.encoder_step_rad)
+        # in standard deviations of a force
+        felt = self._other.standard_normal((2, 6)) * LEVERS
+        felt[:, 2] = errors[-2:]
         return Reading(
-            joints,
-            v[6:] + n.joint_rate * draw(len(v) - 6),
-            v[3:6] + self._gyro_bias + n.gyro * draw(3),
-            force + self._accel_bias + n.accel * draw(3),
-            wrench + n.force * self._wrench_error(),
+            angles,
+            v[6:] + n.joint_rate * errors[joints:-8],
+            v[3:6] + self._gyro_bias + n.gyro * errors[-8:-5],
+            force + self._accel_bias + n.accel * errors[-5:-2],
+            wrench + n.force * felt,
         )
-
-    def _wrench_error(self) -> np.ndarray:
-        """Errors (2, 6) of the foot wrenches, in standard deviations of a force."""
-        error = self._other.standard_normal((2, 6)) * np.repeat([1.0, LEVER_M], 3)
-        error[:, 2] = self._rng.standard_normal(2)
-        return error
 
 
 class Perception:
@@ -72,7 +72,7 @@ class Perception:
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise, seed: int):
         self._sensors = Sensors(noise, seed, robot.gravity)
-        self._worst = np.zeros(2)  # errors of tilt [rad] and velocity [m/s]
+        self._errors: list[tuple[np.ndarray, ...]] = []  # true and believed states
         exact = noise == SensorNoise()  # then the true state stands for its estimate
         self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
 
@@ -80,16 +80,17 @@ class Perception:
         """The true ``state`` as far as the robot knows it."""
         if self._estimator is None:
             return state
-        reading = self._sensors.read(*state)
+        reading = self._sensors.read(*state[:2], state.wrench)
         q, v = self._estimator.update(reading)
-        self._worst = np.maximum(self._worst, estimation_error(*state[:2], q, v))
+        self._errors.append((*state[:2], q, v))
         return State(q, v, reading.foot_wrench)
 
     def to_json(self) -> dict:
         """Kind of the state and its worst errors, for the settings of a result."""
         if self._estimator is None:
             return {"state": "true"}
-        tilt, speed = self._worst.tolist()
+        states = map(np.array, zip(*self._errors, strict=True))
+        tilt, speed = (float(x.max()) for x in estimation_error(*states))
         return {
             "state": "estimated",
             "worst_tilt_error_rad": tilt,
@@ -99,9 +100,15 @@ class Perception:
 
 def estimation_error(
     q: np.ndarray, v: np.ndarray, believed_q: np.ndarray, believed_v: np.ndarray
-) -> tuple[float, float]:
-    """Error of roll and pitch together [rad], and of the base's velocity in the world [m/s]."""
-    true, believed = (rotation(x[3:7]) for x in (q, believed_q))
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (...) of roll and pitch together [rad], and of the base's velocity in the world [m/s],
+    in states (..., nq) and (..., nv).
+    """
+    true, believed = (rotations(x[..., 3:7]) for x in (q, believed_q))
     # between the two ideas of up, in the trunk's axes
-    tilt = np.arccos(np.clip(true[2] @ believed[2], -1.0, 1.0))
-    return float(tilt), float(np.linalg.norm(believed @ believed_v[:3] - true @ v[:3]))
+    level = (true[..., 2, :] * believed[..., 2, :]).sum(axis=-1)
+    moved = (
+        np.einsum("...ij,...j->...i", *x)
+        for x in ((believed, believed_v[..., :3]), (true, v[..., :3]))
+    )
+    return np.arccos(np.clip(level, -1.0, 1.0)), np.linalg.norm(np.subtract(*moved), axis=-1)

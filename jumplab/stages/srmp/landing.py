@@ -10,7 +10,7 @@ It begins right after the impact and ends at rest in the stance.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import casadi as ca
@@ -105,7 +105,7 @@ class LandingPlan(SrmpStance):
         """CoM (2,), its velocity (2,) and L at ``time`` since touchdown; the last sample holds for
         ever.
         """
-        now = _at(time, self.t, self.com, self.com_velocity, self.L)
+        now = self._row(time)
         return now[:2], now[2:4], float(now[4])
 
     def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
@@ -117,13 +117,21 @@ class LandingPlan(SrmpStance):
         """
         if time >= self.t[-1]:
             return np.zeros(2), 0.0
-        now = _at(time, self.t, self.com_acceleration, self.L_rate)
-        return now[:2], float(now[2])
+        now = self._row(time)
+        return now[5:7], float(now[7])
 
+    @cached_property
+    def _rows(self) -> np.ndarray:
+        columns = self.com, self.com_velocity, self.L, self.com_acceleration, self.L_rate
+        return np.column_stack(columns)
 
-def _at(time: float, t: np.ndarray, *columns: np.ndarray) -> np.ndarray:
-    """Columns (n,) or (n, 2) over ``t`` (n,) at a ``time``, one after the other."""
-    return np.array([np.interp(time, t, x) for x in np.column_stack(columns).T])
+    def _row(self, time: float) -> np.ndarray:
+        """CoM, its velocity, L, CoM acceleration and rate of L (8,) at a ``time``."""
+        after = min(max(int(np.searchsorted(self.t, time)), 1), len(self.t) - 1)
+        begin, end = self.t[after - 1 : after + 1]
+        share = min(max((time - begin) / (end - begin), 0.0), 1.0)
+        before = self._rows[after - 1]
+        return before + share * (self._rows[after] - before)
 
 
 def landing_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term]:

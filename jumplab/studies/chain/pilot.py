@@ -97,12 +97,12 @@ class ChainPilot:
         measured ``state``.
         """
         step = round(t / STEP_S)
-        q, v, wrench = state
+        q, v, _ = state
         if self._further and not self.reason:
             self._think(step, q, v)
         if not self.jumps:
             if step % PERIOD_STEPS == 0:
-                self._tau = self._stand.torque(t, q, v, wrench[:, 2])
+                self._tau = self._stand.torque(t, q, v, state.wrench[:, 2])
             return Drive(self._tau)
         controller = self.jumps[-1].controller
         now = self._now(step)

@@ -93,7 +93,7 @@ def run_chain(
 def _jumps(run: Run, chain: ChainPilot, course: Course) -> tuple[ChainedJump, ...]:
     """The jumps of a chain that has been run; the last may not have begun."""
     # the stand before the first jump belongs to it
-    edges = [0, *(round(jump.began_s / STEP_S) for jump in chain.jumps[1:]), len(run.rows)]
+    edges = [0, *(round(jump.began_s / STEP_S) for jump in chain.jumps[1:]), len(run.log.q)]
     jumps = []
     for k, (first, after) in enumerate(pairwise(edges)):
         plans = tuple(plan for plan in chain.plans if plan.number == k)
