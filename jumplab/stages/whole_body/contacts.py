@@ -29,9 +29,8 @@ TIMES = {
 }
 INTERVALS = {"two feet": 12, "one foot": 12, "toes": 6, FLIGHT: 12}
 STEP_SHARE = 0.33  # of the leg: a step or hop of usual length
-LONGER = (
-    0.9  # of a step of usual length, by which the feet of a run-up come down ahead of each other
-)
+# of a step of usual length, by which the feet of a run-up come down ahead of each other
+LONGER = 0.9
 FREE_SHARE = 0.5  # of it, by which those before a target may be longer or shorter
 
 
@@ -395,9 +394,8 @@ def _course(takeoff: str, steps: int, landing: str) -> list[str]:
     """
     last = SIDES.index(takeoff) if takeoff in SIDES else 0
     words = ["LR"]
-    sides = [
-        (last + steps - k) % 2 for k in range(steps + 1)
-    ]  # the one that stands, then the steps
+    # the foot that stands first, then those of the steps
+    sides = [(last + steps - k) % 2 for k in range(steps + 1)]
     if steps or takeoff in SIDES:
         words.append("LR"[sides[0]])
     for before, side in pairwise(sides):
