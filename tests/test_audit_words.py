@@ -138,7 +138,7 @@ def test_the_notes_carry_what_was_found():
 def test_the_manifest_names_robot_target_and_versions():
     tape = random_tape(0)
     assert audit(tape, ROBOT, TASK).manifest == {
-        "robot": "bhr", "robot_hash": ROBOT.hash, "target": dataclasses.asdict(TASK), "samples": 25,
+        "robot": "bhr", "robot_hash": ROBOT.hash, "target": TASK.numbers, "samples": 25,
         "versions": versions()}  # fmt: skip
     assert audit(tape, ROBOT).manifest["target"] is None
 

@@ -155,7 +155,7 @@ def test_the_cheapest_of_several_starts_counts_and_the_others_say_how_they_diffe
     [
         ({"starts": 0}, "starts = 0 must be 1 to 10"),
         ({"starts": 11}, "starts = 11 must be 1 to 10"),
-        ({"starts": 2, "method": "three-step"}, "compares several starts, and only in jumps without"),
+        ({"starts": 2, "method": "three-step"}, "compares several starts, and only in jumps from a stand without"),
         ({"starts": "many"}, "starts must be a whole number"),
     ],
 )

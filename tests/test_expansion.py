@@ -118,14 +118,14 @@ def test_toe_follows_from_the_parabola(plan, bhr):
 
 
 @pytest.mark.parametrize("flat_s, toe_s", [(0.5, 0.1), (0.5004, 0.1), (0.49999, 0.10001), (0.2501, 0.0609)])
-def test_takeoff_falls_on_a_sample_for_any_duration(bhr, flat_s, toe_s):
+def test_takeoff_falls_on_a_sample_for_any_duration(plan, bhr, flat_s, toe_s):
     """Durations that are no multiple of a millisecond: still 1 kHz, at rest before the start, exact at the end."""
     body = Body(bhr)
     durations = {"flat": flat_s, "toe": toe_s, "flight": 0.3337}
     named = [ContactPhase(f, (0.05, 1.5), s, 3, n) for f, (n, s) in zip(FEET, durations.items(), strict=True)]
     schedule = Schedule(body, Contacts(tuple(named), ends="touchdown"), Limits(), Weights())
     still = [np.tile(body.stance, (4, 1)) for _ in named]
-    guess = motions.guess(schedule, motions.Motion(np.array(list(durations.values())), still))
+    guess = motions.guess(schedule, plan.task, motions.Motion(np.array(list(durations.values())), still))
     phases = {}
     for name, g in guess.items():
         t = np.linspace(0, g.duration, 4)

@@ -53,7 +53,7 @@ def test_start_turns_as_asked_and_goes_where_it_should(turns):
     task = JumpTask(0.2, 0.5, rotation_rad=turns * TURN)
     schedule = Schedule(flips.body, flips.contacts, flips.limits, flips.weights, free=flips.free)
     motion = motions.along(schedule, task)
-    guess = motions.guess(schedule, motion)
+    guess = motions.guess(schedule, task, motion)
     flown = motion.charts[-1]
     lean = flown[-1, 5] - turns * TURN
     assert 0.0 < lean < 0.3

@@ -155,7 +155,7 @@ def test_stage_three_begins_with_stage_twos_motion(plan):
             own = np.interp(t, joints.t, joints.q[:, column])
             np.testing.assert_allclose(q[:, column], own, atol=1e-9)
     np.testing.assert_allclose(q[-1], joints.q[-1], atol=1e-9)  # of the flight, its last node: base and all
-    guess = motions.guess(plan.whole_body.schedule, motion)
+    guess = motions.guess(plan.whole_body.schedule, plan.task, motion)
     assert {k: len(g.q) - 1 for k, g in guess.items()} == mesh
     heels = guess["toe"].q[:, -1]
     assert np.all(heels >= 0.0) and heels[-1] > 0.2

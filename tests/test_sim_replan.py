@@ -16,7 +16,7 @@ from jumplab.control.reference import (
 from jumplab.errors import SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.stages.srmp.landing import LandingPlan, touchdown_of_state
+from jumplab.stages.srmp.landing import touchdown_of_state
 
 
 @pytest.fixture
@@ -30,7 +30,12 @@ class Landing:
     com: np.ndarray
     com_velocity: np.ndarray
     L: np.ndarray
-    at = LandingPlan.at
+
+    def at(self, time):
+        com, velocity = (
+            np.array([np.interp(time, self.t, x) for x in rows.T]) for rows in (self.com, self.com_velocity)
+        )
+        return com, velocity, float(np.interp(time, self.t, self.L))
 
 
 def standing(ahead_m=0.0, speed=0.0):

@@ -131,7 +131,7 @@ def test_a_start_in_the_stance_is_carried_along(short):
 def test_start_values_of_a_motion_share_nodes_and_carry_the_robot(short):
     task, schedule = jl.JumpTask(distance_m=0.4, height_m=0.2), schedule_of(short)
     motion = beginning.along(schedule, task)
-    found = beginning.guess(schedule, motion)
+    found = beginning.guess(schedule, task, motion)
     assert list(found) == [p.name for p in schedule.contacts.phases]
     nv, parts = schedule.modes[0].nv, list(found.values())
     for one, other in pairwise(parts):

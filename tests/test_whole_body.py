@@ -249,7 +249,7 @@ def test_a_start_keeps_its_place(bhr, target):
     task = JumpTask(*target)
     schedule = Schedule(body, jump_contacts(LIMITS, Mesh()), LIMITS, Weights(), free=even(body))
     motion = motions.along(schedule, task)
-    guess = motions.guess(schedule, motion)
+    guess = motions.guess(schedule, task, motion)
     assert [len(g.q) - 1 for g in guess.values()] == list(Mesh().intervals().values())
     for g in guess.values():
         assert all(np.all(np.isfinite(x)) for x in (g.q, g.v, g.a, g.z, *g.constants.values()))

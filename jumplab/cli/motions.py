@@ -1,12 +1,11 @@
 """The commands about motion clips: judge, mend."""
 
 import json
+import math
 from argparse import Namespace
 from collections import Counter
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import jumplab as jl
 from jumplab import io
@@ -56,10 +55,10 @@ def _better_rate(report: Any) -> int | None:
     falls = [-flight["acceleration_m_s2"][2] for flight in report.manifest["flights"]]
     if not falls or min(falls) <= 0:
         return None
-    wanted = report.clip.fps * np.sqrt(report.clip.robot.gravity / np.array(falls))
-    rate = min(RATES, key=lambda x: abs(np.log(wanted / x)).max())
+    wanted = [report.clip.fps * math.sqrt(report.clip.robot.gravity / fall) for fall in falls]
+    rate = min(RATES, key=lambda x: max(abs(math.log(want / x)) for want in wanted))
     ratio = max(rate / report.clip.fps, report.clip.fps / rate)
-    there = np.abs(wanted / rate - 1).max() < NEAR
+    there = max(abs(want / rate - 1) for want in wanted) < NEAR
     return rate if there and OTHER[0] < ratio < OTHER[1] else None
 
 

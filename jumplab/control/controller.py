@@ -247,7 +247,7 @@ class Controller:
             landing = self.landing
             q, v, _ = state
             time = since * STEP_S
-            if self.ahead.again and self.ahead.followed == "planned" and self.stepped_s is None:
+            if self.ahead.again and self.ahead.followed == "planned" and not self.steps_s:
                 landing.reference = self.ahead.follow(time, q, v, landing.reference)
             self._tau = landing.torque(time, q, v, state.wrench[:, 2])
         return Command(tau=self._tau)

@@ -187,6 +187,7 @@ class Planner(Shown):
         """
         return self.direct(task).program(task, weights)
 
+    @checked
     @in_turn
     def direct(self, task: JumpTask) -> WholeBodyPlanner:
         """The direct planner of a target: that of jumps or of flips from a stand, or the one along

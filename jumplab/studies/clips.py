@@ -12,7 +12,7 @@ import os
 import shutil
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -258,10 +258,11 @@ def _clip(
     """
     robot = planner.robot
     folder = reading.below(out, told["name"])
-    key = key_of("clip", robot.hash, task.numbers)
+    target = task.numbers if isinstance(task, JumpTask) else asdict(task)
+    key = key_of("clip", robot.hash, target)
     row = store.read_json(folder / ROW) if (folder / ROW).is_file() else {}
     if row.get("key") != key or (again and not row.get("passed")):
-        head = {"target": task.numbers, "robot": robot.hash, "key": key}
+        head = {"target": target, "robot": robot.hash, "key": key}
         staging = reading.below(out, STAGING, told["name"])
         shutil.rmtree(staging, ignore_errors=True)  # left by a run that was killed
         with made(staging):
