@@ -132,8 +132,8 @@ class JumpTask(Shown):
     @classmethod
     @checked
     def of(cls, data: Mapping[str, Any]) -> Self:
-        """The target in plain ``data``, as summaries of plans have it; numbers of other versions
-        are left out.
+        """The target in plain ``data`` (its fields by name, SI), as summaries of plans have it;
+        numbers of other versions are left out.
 
         Raises :class:`InputError` if it lacks distance or rise, or for numbers that cannot be
         meant.

@@ -41,7 +41,7 @@ class Log(NamedTuple):
     colliding: np.ndarray  # (n,) whether links of the robot press on each other
 
     def some(self, rows: slice) -> Log:
-        """Some rows of it."""
+        """Some of its rows (steps)."""
         return Log(*(column[rows] for column in self))
 
 

@@ -235,7 +235,7 @@ class Contacts:
         return max((k for k, p in enumerate(self.phases) if p.flying), default=-1)
 
     def is_aimed(self, contact: int) -> bool:
-        """Whether a contact, by its index into :attr:`landings`, is one that the target places."""
+        """Whether a contact (index into :attr:`landings`) is one that the target places."""
         return self.aimed and self.landings[contact][0] > self.last_flight
 
     def eased(self, share: float) -> Contacts:

@@ -210,8 +210,8 @@ def from_solved(program: Program, solved: Solved) -> Beginning:
 
 
 def unpassed(program: Program, asked: Asked, rows: Sequence[Apart]) -> Beginning:
-    """The stance, carried along the schedule, with links that met kept where they were before they
-    did: an arm that cannot swing past a thigh stays behind it.
+    """The stance, carried along the schedule, with links that met (``rows``) kept where they were
+    before they did: an arm that cannot swing past a thigh stays behind it.
     """
     kept = tuple(replace(x, pair=x.before or x.pair, more_m=0.0) for x in rows)
     return replace(from_stance(program, asked), apart=kept)

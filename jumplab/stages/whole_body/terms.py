@@ -48,8 +48,8 @@ CLEAR = {"scale": PLACE_SCALE, "group": "clearance"}
 
 
 def smoothness(m: Mode, follows: bool = False) -> list[Term]:
-    """Costs on accelerations, jerk, torques and forces, and on the waist's and the arms' way from
-    the stance, or from the motion that it ``follows``.
+    """Costs [1] on accelerations, jerk, torques and forces, and on the waist's and the arms' way
+    from the stance, or from the motion that it ``follows``.
     """
     w = m.weights
     origin = "WL-J2, WF-J2"
@@ -424,9 +424,9 @@ def rise() -> Term:
 def distance_flown(
     body: Body, names: Sequence[str], left: Sequence[Contact], landed: Sequence[Contact]
 ) -> Term:
-    """Each foot that has ``landed`` is as far ahead of where it stood first as those that ``left``,
-    and the distance of the target; contacts by number of the phase, of which ``names`` are given,
-    and side.
+    """Each foot that has ``landed`` is as far ahead of where it stood first [m] as those that
+    ``left``, and the distance of the target; contacts by number of the phase, of which ``names``
+    are given, and side.
     """
 
     def ahead(ends, contact):
