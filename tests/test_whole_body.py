@@ -21,7 +21,7 @@ from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.starts import GIVEN, IN_PLANE
 from jumplab.task import JumpTask
 
-LIMITS = Limits()
+LIMITS, MG = Limits(), 42.0 * 9.8
 JUMPS = [
     (1.0, 0.5, 0.0, "three-step"),
     (0.6, 0.5, 0.3, "three-step"),
@@ -98,6 +98,29 @@ def test_its_audit_is_clean(run):
 
 # dynamics on the tape -------------------------------------------------------------------------------------------
 # contact --------------------------------------------------------------------------------------------------------
+def test_base_residual(run):
+    """Six rows that no motor can help, between the nodes too: a millionth of the weight (on a lever of 1 m)."""
+    assert np.abs(run.residual[:, :6]).max() < 1e-6 * MG
+
+
+def test_flight_is_ballistic(run):
+    t = run.tape.t[run.flying][:, None] - run.tape.takeoff_time
+    com, velocity = run.com[run.flying], run.com_velocity[run.flying]
+    parabola = com[0] + t * velocity[0] - np.array([0.0, 0.0, 4.9]) * t**2
+    assert np.abs(com - parabola).max() < 1e-9
+    assert np.ptp(run.L[run.flying]) < 1e-9
+    assert np.abs(run.tape.f[run.flying]).max() == 0.0
+
+
+# contact --------------------------------------------------------------------------------------------------------
+def test_toe_stays_and_nothing_sinks(run):
+    launch = ~run.flying
+    toe = run.corners[launch][:, :, 2:]
+    assert np.abs(toe - toe[0]).max() < 1e-9
+    np.testing.assert_allclose(toe[0, ..., 2], 0.0, atol=1e-9)
+    assert run.corners[launch][..., 2].min() > -1e-9
+
+
 # the target -----------------------------------------------------------------------------------------------------
 def test_touchdown(run):
     task, corners = run.plan.task, run.corners
