@@ -22,7 +22,8 @@ MILDER = 0.6  # of a number that was refused
 BEYOND = 1.4  # times the least distance that a platform takes
 ON_THE_SPOT = 3  # after so many tries a jump on the level that goes nowhere is the next
 # so many easier targets are tried, and none is begun after so long [s of CPU time], or once the
-# patience for the target itself is spent and so many times of it besides: the usual 20 s become 22
+# patience for the target itself is spent and so many times of it besides: a refusal after
+# the usual 20 s ends within 25, the last program that was begun included
 TRIES = 8
 LONGEST_S = 30.0
 AFTER = 0.1

@@ -229,7 +229,8 @@ class Program(Shown):
         """
         solved = self.solve(asked, start)
         held = start.held
-        still = start.rough or start.begin is from_neighbour or self.contacts.ends == "rest"
+        # whether links may yet be kept on the sides where they were before they met
+        sides = not (start.rough or start.begin is from_neighbour or self.contacts.ends == "rest")
         for number in range(ROUNDS):
             begin = from_solved(self, solved)
             rows = merged(begin.apart, self._met(solved))
@@ -240,11 +241,11 @@ class Program(Shown):
             after_rough = HELD_AFTER_ROUGH if start.held else AFTER_ROUGH
             again = after_rough[min(number, 1)] if start.rough else APART[not held]
             ways = [(again, begin), (APART[-1], begin)][: 1 + held]
-            if not still:  # where more distance does not help, they may not pass each other
+            if sides:  # where more distance does not help, they may not pass each other
                 ways.insert(0 if more else len(ways), (STILL, unpassed(self, asked, rows)))
             solved, way = self._first(asked, ways)
             held = held and way.held
-            still = still or way is STILL
+            sides = sides and way is not STILL
         return solved
 
     def _first(self, asked: Asked, ways: Sequence[tuple[Start, Beginning]]) -> tuple[Solved, Start]:
