@@ -38,6 +38,7 @@ SEEN_SHARE = 1e-3
 STANDARD = ("distance_m", "height_m", "robot", "out", "figures")  # parameters of every notebook
 TYPES = {kind.__name__: kind for kind in (int, bool, float, str)}
 PATTERN = "[0-9][0-9]_*.ipynb"
+START_S = 180  # that a kernel has to answer, of which a busy machine takes most
 _PACKAGE = Path(__file__).resolve().parent.parent
 _PACKAGE_PARENT = _PACKAGE.parent
 Kinds = Mapping[str, type | range | None]  # of parameters; None can be anything
@@ -263,7 +264,9 @@ def _execute(
         kernel["kernel_manager_class"] = _kernel(scratch, notebook, work, groups)
         places = (_literal(notebook), _literal(executed))
         try:
-            papermill.execute_notebook(*places, given, progress_bar=bar, **kernel)
+            papermill.execute_notebook(
+                *places, given, progress_bar=bar, start_timeout=START_S, **kernel
+            )
         except papermill.PapermillExecutionError as e:
             failed.mkdir(exist_ok=True)
             place = shutil.copy(executed, failed)
@@ -333,6 +336,8 @@ def _kernel(scratch: str, notebook: Path, work: Path, groups: list[int]) -> type
     class ThisInterpreter(AsyncKernelManager):
         kernel_spec = KernelSpec(argv=[sys.executable, *launch.split()], env=env, language="python")
         connection_file = Unicode(f"{scratch}/kernel.json")
+        # kernels that start at the same time may be given the same free port; Windows has no ipc
+        transport = Unicode("tcp" if os.name == "nt" else "ipc")
 
         async def start_kernel(self, **kwargs: Any) -> None:
             quiet = {"stdout": DEVNULL, "stderr": DEVNULL}  # cells print another way
