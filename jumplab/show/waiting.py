@@ -23,12 +23,12 @@ WIDTH = 110  # a longer line would wrap on most terminals
 @contextlib.contextmanager
 def waiting(out: TextIO, head: str = "", first: str = "") -> Iterator[None]:
     """Within the block, what long work says of itself is a line of ``out``, gone at the end;
-    ``first`` is there before it says anything.
+    ``first`` is there at once, before it says anything.
 
     A thread of its own keeps it up to date: a solve, or a robot's meshes, say nothing for long.
     """
     form = "{desc}, {elapsed_s:.0f} s"
-    timing = dict(delay=FIRST_S, mininterval=REDRAW_S, miniters=0)
+    timing = dict(delay=0.0 if first else FIRST_S, mininterval=REDRAW_S, miniters=0)
     count = ""
     with tqdm(bar_format=form, leave=False, ncols=WIDTH, nrows=20, file=out, **timing) as bar:
 
