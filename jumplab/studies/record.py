@@ -30,7 +30,7 @@ from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.limiting import limit_of
 from jumplab.stages.whole_body.problem import SOUGHT
 from jumplab.stages.whole_body.program import Program, Solved
-from jumplab.stages.whole_body.starts import RECORD, SEEKING, Asked
+from jumplab.stages.whole_body.starts import FROM_NEIGHBOUR, RECORD, SEEKING, Asked
 from jumplab.stages.whole_body.terms import WORTH
 from jumplab.studies.advice import keep_record
 from jumplab.studies.prices import Prices, priced
@@ -47,6 +47,8 @@ EASY = {
     "side_m": ((0.1, 0.15), (0.3, 0.3)),
     "yaw_rad": ((0.3, 0.12), (1.0, 0.3)),
 }
+HALVES = 0.5, 0.25  # of the easiest, where none of them has a plan
+GROWS = 1.5  # times the turn before, from one plan to the next
 # shares of the best that they led to, whose own plans, of least effort, are the next starts
 CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
@@ -274,10 +276,16 @@ class _Search:
         """
         leg = self.stage.body.leg_m
         alone = not self.given.standing
-        for number, rise in EASY[self.what][alone : 2 if alone else None]:
+        easy = EASY[self.what][alone : 2 if alone else None]
+        less = [(share * easy[0][0], share * easy[0][1]) for share in HALVES]
+        for k, (number, rise) in enumerate([*easy, *less]):
+            if k >= len(easy) and best:
+                break
             x = number if self.what == "yaw_rad" else number * leg
-            more = {"height_m": rise * leg} if "takeoff_speed" in self.sought else {}
-            yield replace(self.given, **(more | {self.what: x}))
+            sizes = {self.what: x}
+            if "takeoff_speed" in self.sought:
+                sizes["height_m"] = max(rise * leg, RANGES["height_m"][1])
+            yield replace(self.given, **sizes)
         for share in CLIMB if best and not alone else ():
             yield self.at(max(best, key=lambda x: x[0])[1], share)
 
@@ -295,6 +303,8 @@ class _Search:
                 # after steps links meet, and a record begins with their rows
                 begin = self.stage.solved if task.standing else self.stage.plan
                 near = begin(task)
+                if self.what == "yaw_rad":
+                    task, near = self.turned(task, near)
                 program = self.program(task)
                 solved = program.solve_apart(Asked(task, near=near), SEEKING)
             except (InfeasibleError, SolverError) as e:
@@ -312,6 +322,19 @@ class _Search:
         _, task, solved = max(best, key=lambda x: x[0])
         self.task = task
         return found, solved
+
+    def turned(self, task: JumpTask, near: Solved) -> tuple[JumpTask, Solved]:
+        """The largest turn that plans lead to, each from the one before, with rows for the links
+        that met on the way: where the largest turn is sought at once, legs pass through each other.
+        """
+        largest = RANGES["yaw_rad"][2]
+        with suppress(InfeasibleError, SolverError):
+            while GROWS * task.yaw_rad < largest:
+                more = self.at(task, GROWS)
+                program = self.stage.program(more)
+                near = program.solve_apart(Asked(more, near=near), FROM_NEIGHBOUR[0])
+                task = more
+        return task, near
 
     def refuse_end(self, task: JumpTask, solved: Solved) -> None:
         """Refuse a record that a number of the problem ends, not the robot."""

@@ -243,6 +243,10 @@ class Program(Shown):
             ways = [(again, begin), (APART[-1], begin)][: 1 + held]
             if sides:  # where more distance does not help, they may not pass each other
                 ways.insert(0 if more else len(ways), (STILL, unpassed(self, asked, rows)))
+            if self.sought and number == 0:  # what is largest without them may be far off
+                first = start.begin(self, asked)
+                kept = [replace(x, pair=x.before or x.pair, more_m=0.0) for x in rows]
+                ways.insert(0, (start, replace(first, apart=merged(first.apart, kept))))
             solved, way = self._first(asked, ways)
             held = held and way.held
             sides = sides and way is not STILL
