@@ -107,9 +107,12 @@ class Limits:
 
     def of_size(self, size: Size) -> Limits:
         """Those of a robot of another ``size``, whose jumps they make alike; edges of platforms
-        are the world's, and how long a flight may last depends on gravity.
+        are the world's, and how long a flight may last depends on gravity. Links of small robots
+        keep the same distance, since the audit's is of meshes, which are as fine for all.
         """
-        return size.scaled(self, LIMIT_UNITS)
+        scaled = size.scaled(self, LIMIT_UNITS)
+        kept = max(scaled.link_distance_m, self.link_distance_m)
+        return replace(scaled, link_distance_m=kept)
 
     def of_flip(self) -> Limits:
         """The same for a jump that turns over: time to wind up, a trunk that arrives turning,
