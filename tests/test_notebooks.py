@@ -208,6 +208,15 @@ def test_a_second_chain_in_one_folder_is_refused(tmp_path):
         notebooks.run_notebooks(notebooks=chain, progress=False)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="no ipc")
+def test_kernels_need_no_ports(tmp_path):
+    """Two that start at once could be given the same free one."""
+    cell = "from ipykernel import get_connection_info\nassert get_connection_info(unpack=True)['transport'] == 'ipc'"
+    paths = [make_notebook(tmp_path, f"0{k}_x", cell) for k in range(3)]
+    report = notebooks.run_notebooks(out=tmp_path / "out", notebooks=paths, progress=False, jobs=2)
+    assert report.notebooks == ("00_x", "01_x", "02_x")
+
+
 def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
     path = tmp_path / "notebooks" / "00_x.ipynb"
     path.parent.mkdir()
