@@ -7,6 +7,7 @@ local solver.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -54,7 +55,7 @@ def row(name: str, what: str) -> dict[str, Any]:
         ends = dict.fromkeys(f"{x.joint.replace('_', ' ')} {x.limit}".strip() for x in best.limits)
         found |= {
             "value": round(best.value, 4),
-            "bound": round(best.bound, 4),
+            "bound": round(best.bound, 4) if math.isfinite(best.bound) else None,  # a turn has none
             "rise_m": round(best.plan.planned_rise_m, 4),
             "apex_m": round(best.plan.planned_apex_m, 4),
             "starts": {word: x if x == x else None for word, x in best.found.items()},
