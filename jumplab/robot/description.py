@@ -380,7 +380,7 @@ class Robot(Shown):
 
     @cached_property
     def bus(self) -> Bus:
-        """What all motors may draw together, and how warm each may get; nothing is limited that the
+        """Limits of all motors together, and of the warmth of each; nothing is limited that the
         TOML does not name.
         """
         config = read_toml(self.config_text, "robot configuration")

@@ -134,7 +134,7 @@ def motor_lines(m: Mode, skip: tuple[int, int]) -> Term:
 
 
 def bus_power(m: Mode, skip: tuple[int, int]) -> list[Term]:
-    """What all motors draw together, sum of tau q' + losses tau^2, braking less what is not used
+    """Power that all motors draw, sum of tau q' + losses tau^2, braking less what is not used
     [W]; of a robot that limits it.
     """
     bus = m.robot.bus
