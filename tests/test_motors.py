@@ -314,3 +314,53 @@ def test_exported(heavy, plan, tmp_path):
     rows = [model.joint(name).dofadr[0] for name in heavy.joint_names]
     for key, own in zip(KEYS, (model.dof_armature, model.dof_frictionloss, model.dof_damping), strict=True):
         assert np.allclose(own[rows], getattr(heavy.limits, key)) and own[:6].max() == 0
+
+
+# all together -------------------------------------------------------------------------------------------------------
+def power_of(tape, used: float = 1.0) -> np.ndarray:
+    """Power of all joints (N,) [W], with the share of braking that is used."""
+    shaft = tape.tau * tape.v[:, 6:]
+    return np.where(shaft > 0, shaft, used * shaft).sum(axis=1)
+
+
+def with_bus(robot: Robot, told: str) -> Robot:
+    return Robot(robot.urdf, f"{robot.config_text}\n[bus]\n{told}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("used", [1.0, 0.25])
+def test_a_bus_that_gives_less_than_a_plan_asks_binds(plan, heavy, used):
+    """The limit is below the free plan's peak; the plan with it comes near, and keeps it between the nodes too."""
+    most = 0.8 * power_of(plan.tape, used).max()
+    robot = with_bus(heavy, f"power_w = {most:.3f}\nregeneration = {used}\n")
+    limited = Planner(robot).plan(plan.task)
+    assert 0.9 * most < power_of(limited.tape, used).max() < most
+    (check,) = (x for x in limited.audit.checks if x.name == "bus power")
+    assert limited.audit.passed and check.value == pytest.approx(100 * power_of(limited.tape, used).max() / most)
+    (check,) = (x for x in audit(plan.tape, robot, plan.task).failed if x.name == "bus power")
+    assert check.value == pytest.approx(125.0, abs=1e-3)
+
+
+def test_windings_that_warm_are_audited(plan, heavy):
+    """A lower limit on the root mean square than the torque has fails by as much; losses add to the power."""
+    tape = plan.tape
+    k = heavy.joint_names.index("left_knee")
+    mean = np.sqrt(np.trapezoid(tape.tau[:, k] ** 2, tape.t) / np.ptp(tape.t))
+    drawn = power_of(tape) + 0.02 * tape.tau[:, k] ** 2
+    told = f"power_w = {drawn.max():.9g}\nlosses.left_knee = 0.02\nrms.left_knee = {mean / 1.5:.9g}\n"
+    checks = {x.name: x for x in audit(tape, with_bus(heavy, told), plan.task).checks}
+    assert checks["torque over the motion"].value == pytest.approx(150.0, abs=1e-3)
+    assert "left_knee" in checks["torque over the motion"].note
+    assert checks["bus power"].value == pytest.approx(100.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("told, sentence", [
+    ("power_w = -5", "[bus]: power_w = -5 W must be positive, and regeneration = 1 between 0 and 1"),
+    ("regeneration = 1.5", "[bus]: power_w = inf W must be positive, and regeneration = 1.5 between 0 and 1"),
+    ("losses.neck = 1.0",
+     "[bus.losses]: neck = 1 must name a joint that moves, and be positive, at most inf"),
+    ("rms.left_knee = 1e4",
+     "[bus.rms]: left_knee = 10000 must name a joint that moves, and be positive, at most 210"),
+])  # fmt: skip
+def test_a_bus_that_cannot_be(bhr, told, sentence):
+    assert refused(lambda: with_bus(bhr, told)) == f"robot bhr: {sentence}"

@@ -113,6 +113,14 @@ def joints(r: Replay) -> Iterator[Measure]:
     yield "joint speed", np.abs(r.tape.v[:, 6:]) / m.upperVelocityLimit[6:], t, r.joints
     yield "joint torque", torque / m.upperEffortLimit[6:], t, r.joints
     yield "torque at speed", torque / available_torque(r), t, r.joints
+    bus = r.robot.bus
+    if np.isfinite(bus.power_w):
+        shaft = r.tape.tau * r.tape.v[:, 6:]
+        used = np.where(shaft < 0, bus.regeneration * shaft, shaft) + bus.losses * r.tape.tau**2
+        yield "bus power", used.sum(axis=1) / bus.power_w, t
+    if np.isfinite(bus.rms).any():
+        mean = r.integral(r.tape.tau**2)[-1] / (t[-1] - t[0])
+        yield "torque over the motion", np.sqrt(mean[None]) / bus.rms, None, r.joints
     if locked := r.robot.locked:
         holding = np.abs(r.holding) / [x.effort for x in locked]
         yield "torque of locked joints", holding, t, tuple(x.name for x in locked)

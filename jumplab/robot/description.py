@@ -33,7 +33,7 @@ from jumplab.robot.files import (
     roles_table,
 )
 from jumplab.robot.locked import LockedJoint, locked_joints
-from jumplab.robot.motors import MotorLimits, read_only
+from jumplab.robot.motors import Bus, MotorLimits, read_only
 from jumplab.robot.reduction import in_plane
 from jumplab.robot.sagittal import SagittalModel, reduce
 from jumplab.robot.stance import check_stance, standing
@@ -202,6 +202,7 @@ class Robot(Shown):
                 raise self.error(f"the foot link {name!r} is not in the URDF; correct the name")
 
     def _check_numbers(self) -> None:
+        _ = self.bus
         for name, a in self.actuators.items():
             in_order = a["lower"] < a["upper"] and a["effort"] > 0 and a["speed"] > 0
             if not (in_order and np.all(np.isfinite([*a.values()]))):
@@ -376,6 +377,33 @@ class Robot(Shown):
         ends = m.lowerPositionLimit[q], m.upperPositionLimit[q]
         effort = m.upperEffortLimit[v]
         return MotorLimits(*ends, speed, effort, corner * speed, no_load * speed, *losses)
+
+    @cached_property
+    def bus(self) -> Bus:
+        """Limits of all motors together, and of the warmth of each; nothing is limited that the
+        TOML does not name.
+        """
+        config = read_toml(self.config_text, "robot configuration")
+        power = entry(config, "bus", "power_w", default=np.inf)
+        share = entry(config, "bus", "regeneration", default=1.0)
+        if not (power > 0 and 0 <= share <= 1):
+            raise self.error(
+                f"[bus]: power_w = {power:g} W must be positive, and regeneration = {share:g} "
+                "between 0 and 1"
+            )
+        columns = []
+        for key, default in (("losses", 0.0), ("rms", np.inf)):
+            given = numbers(config, "bus", key)
+            efforts = self.limits.effort + (np.inf if key == "losses" else 0.0)
+            most = dict(zip(self.joint_names, efforts, strict=True))
+            for name, value in given.items():
+                if not 0 < value <= most.get(name, -1):
+                    raise self.error(
+                        f"[bus.{key}]: {name} = {value:g} must name a joint that moves, and be "
+                        f"positive, at most {most.get(name, np.inf):g}"
+                    )
+            columns.append(read_only([given.get(name, default) for name in self.joint_names]))
+        return Bus(power, share, *columns)
 
     @cached_property
     def locked(self) -> tuple[LockedJoint, ...]:

@@ -42,6 +42,7 @@ TABLES = {
     "stance": STANCE,
     "rest": (),
     "actuators": ("corner_speed_ratio", *MOTORS),
+    "bus": ("power_w", "regeneration", "losses", "rms"),
     "published": ("trunk", "xyz_m", "rpy_rad", "urdf", "held"),
     "source": (),  # where the URDF came from; only the importer reads it
 }

@@ -1,4 +1,4 @@
-"""Torque that the joints' motors can give at a speed, and their losses."""
+"""Torque that the joints' motors can give at a speed, their losses, and what all may draw."""
 
 from __future__ import annotations
 
@@ -70,3 +70,29 @@ class MotorLimits:
         the sense of the rate: friction tanh(rate / :data:`SLIDING_RATE`) + damping rate.
         """
         return self.friction * np.tanh(np.asarray(rates) / SLIDING_RATE) + self.damping * rates
+
+
+@dataclass(frozen=True)
+class Bus:
+    """Electrical limits of all joints' motors together, as far as a robot's table [bus] gives them.
+
+    Attributes
+    ----------
+    power_w : that they may draw at once [W]; inf where none is given.
+    regeneration : share [1] of what braking joints give that the others can use.
+    losses : (n,) of the windings [W/(N m)^2].
+    rms : (n,) root mean square of the torque over a motion that a winding stands [N m], or inf.
+    """
+
+    power_w: float
+    regeneration: float
+    losses: np.ndarray
+    rms: np.ndarray
+
+    def drawn(self, tau: Any, rates: Any, xp: Any = np, smooth_w: float = 0.0) -> Any:
+        """Power of each joint (..., n) [W] at torques ``tau`` and ``rates`` (..., n), with the
+        module ``xp`` that has their sqrt; its kink rounded over ``smooth_w``.
+        """
+        shaft = tau * rates
+        braked = (xp.sqrt(shaft**2 + smooth_w**2) - shaft) / 2
+        return shaft + (1 - self.regeneration) * braked + self.losses * tau**2

@@ -23,6 +23,7 @@ from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
 from jumplab.stages.whole_body.terms import (
     body_clearance,
+    bus_power,
     distance_flown,
     dynamics,
     flight_rows,
@@ -163,6 +164,7 @@ class Schedule:
         landed = self.landed(k)
         once = (int(k > 0 and not landed), 0)  # the phase before has the rows of a shared node
         terms = [*smoothness(m, self.follows), *dynamics(m, once), motor_lines(m, once)]
+        terms += bus_power(m, once)
         terms += [body_clearance(m), *sides_apart(m)]
         for side in m.sides:  # a first node that is given or shared needs no rows
             terms += foot_rows(m, side, not landed, side in landed)

@@ -19,6 +19,7 @@ class Limits:
 
     torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
     speed_share: float = 0.90  # of the speed limit
+    power_share: float = 0.95  # of what all motors may draw: between the nodes they draw more
     # below the lowest friction that trials have (0.5), so that it holds between the nodes too
     friction: float = 0.42
     range_margin_rad: float = 0.03  # to the joint stops

@@ -11,6 +11,7 @@ import numpy as np
 
 from jumplab.models.spatial import SpatialState, cross
 from jumplab.ocp.problem import Term, limit
+from jumplab.robot.motors import SLIDING_RATE
 from jumplab.robot.reduction import mirror
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES
@@ -35,6 +36,7 @@ CAPTURE = "replaces WF-E2"
 TORQUE_SPEED = "torque-speed"  # the term of the motors' lines
 # of the knees at touchdown, kept from where the hips stop them: a landing sinks
 SQUAT_ROOM_RAD = 0.15
+SMOOTH_W = 1e-3  # of the power that all motors may draw, about where a joint begins to brake
 HOLDING = "torques of held joints"  # the term of :func:`.held_joints`
 RECORD = "record"  # the term of what is largest
 FAR = 100.0  # [m, m/s, rad] beyond any of it, so that its cost is nearly a straight line
@@ -129,6 +131,24 @@ def motor_lines(m: Mode, skip: tuple[int, int]) -> Term:
 
     words = TORQUE_SPEED, "ours: motor line", "of the effort", "node"
     return limit(*words, line, -most, most, skip=skip)
+
+
+def bus_power(m: Mode, skip: tuple[int, int]) -> list[Term]:
+    """Power that all motors draw, sum of tau q' + losses tau^2, braking less what is not used
+    [W]; of a robot that limits it.
+    """
+    bus = m.robot.bus
+    if not np.isfinite(bus.power_w):
+        return []
+    most = m.limits.power_share * bus.power_w
+
+    def drawn(p):
+        rates = p.tree.v[BASE:]
+        rubbed = ca.DM(m.body.motors.friction) * ca.tanh(rates / SLIDING_RATE)
+        return ca.sum1(bus.drawn(p.joint_torques + rubbed, rates, ca, SMOOTH_W * most))
+
+    words = "bus power", "ours: limit", "W", "node"
+    return [limit(*words, drawn, -np.inf, most, scale=most, skip=skip)]
 
 
 def body_clearance(m: Mode) -> Term:
