@@ -123,6 +123,17 @@ class Gauge:
         pin.framesForwardKinematics(self.model, self.data, q)
         return [self.data.oMf[frame].copy() for frame in self.frames]
 
+    def feet(self, q: np.ndarray) -> np.ndarray:
+        """Homogeneous transforms (N, 2, 4, 4) of both feet in ``q`` (N, nq) [m]."""
+        out = np.empty((len(q), 2, 4, 4))
+        model = self.model
+        data = self.data
+        for row, angles in zip(out, q, strict=True):
+            pin.forwardKinematics(model, data, angles)
+            for side, frame in enumerate(self.frames):
+                row[side] = pin.updateFramePlacement(model, data, frame).homogeneous
+        return out
+
     def soles(self, q: np.ndarray) -> np.ndarray:
         """Mean of both soles' middles (3,) in ``q`` (nq,) [m]."""
         return np.mean([foot.act(self.robot.foot.center) for foot in self.places(q)], axis=0)

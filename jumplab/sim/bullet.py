@@ -126,9 +126,9 @@ def base_from_bullet(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
     attitude = rotation(quaternion)
-    arm = attitude @ lever
-    twist = np.array([velocity - moments(rate, arm), rate]) @ attitude
-    return np.concatenate([position - arm, quaternion]), twist.ravel()
+    spin = rate @ attitude
+    speed = velocity @ attitude + pin.skew(lever) @ spin
+    return np.concatenate([position - attitude @ lever, quaternion]), np.concatenate([speed, spin])
 
 
 class BulletEngine(Engine):
@@ -258,7 +258,8 @@ class BulletEngine(Engine):
         twist = self._bullet.getBaseVelocity(self._body)
         base_q, base_v = base_from_bullet(*map(np.array, (*pose, *twist)), self._lever)
         rows = self._bullet.getJointStates(self._body, self._joints)
-        angles, rates = np.array([row[:2] for row in rows]).T
+        angles = [row[0] for row in rows]
+        rates = [row[1] for row in rows]
         return np.concatenate([base_q, angles]), np.concatenate([base_v, rates])
 
     def set_torque(self, tau: np.ndarray) -> None:
@@ -283,7 +284,7 @@ class BulletEngine(Engine):
             moment = rotation(q[3:7]) @ returned[3:6]
             self._bullet.applyExternalTorque(self._body, -1, moment, bullet.WORLD_FRAME)
         self._bullet.setJointMotorControlArray(
-            self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau
+            self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau.tolist()
         )
         self._bullet.stepSimulation()
         self._note()

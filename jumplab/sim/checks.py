@@ -145,17 +145,21 @@ def unexplained(result: SimulationResult) -> tuple[np.ndarray, np.ndarray]:
     motors = robot.limits
     engine = result.settings["engine"]
     data = model.createData()
-    feet = on_feet(robot, np.zeros(3))
     states = _steps(result)
     left = np.empty_like(states[2])
     pushes, place = _pushes(result)
-    loaded = result.foot_wrench.any(axis=-1).tolist()
-    for k, (q, v, a) in enumerate(zip(*states, strict=True)):
-        left[k] = pin.rnea(model, data, q, v, a)
-        if any(loaded[k]):
-            pin.computeJointJacobians(model, data, q)
-            for at, wrench in zip(feet, result.foot_wrench[k], strict=True):
-                left[k] -= wrench @ at.slope(model, data)
+    # the ground's wrenches, in the frames of the joints that carry the feet
+    acting = pin.StdVec_Force([pin.Force.Zero()] * model.njoints)
+    feet = result.feet if engine["substeps"] == 1 else Gauge(robot).feet(states[0])
+    ground = result.foot_wrench[:-1].reshape(-1, 2, 2, 3) @ feet[: len(left), :, :3, :3]
+    ground = ground.reshape(-1, 2, 6)
+    for side, at in enumerate(on_feet(robot, np.zeros(3))):
+        ground[:, side] = ground[:, side] @ at.placement.toActionMatrixInverse()
+    left_foot, right_foot = (at.joint for at in on_feet(robot, np.zeros(3)))
+    for k, row in enumerate(zip(*states, strict=True)):
+        acting[left_foot].vector = ground[k, 0]
+        acting[right_foot].vector = ground[k, 1]
+        left[k] = pin.rnea(model, data, *row, acting)
     for k in np.flatnonzero(pushes[:-1].any(axis=1)):
         force = rotation(states[0][k, 3:7]).T @ pushes[k]
         left[k, :6] -= [*force, *np.cross(place, force)]
@@ -192,12 +196,14 @@ def _momentum_unexplained(result: SimulationResult) -> np.ndarray:
     not.
     """
     robot = result.robot
-    gauge = Gauge(robot)
-    weight = robot.total_mass * robot.model.gravity.linear
-    motions = [gauge.motion(*row)[1:4] for row in zip(result.q, result.v, strict=True)]
-    com, velocity, spin = np.array(motions).swapaxes(0, 1)
-    linear = robot.total_mass * velocity
-    spin = spin + np.cross(com, linear)
+    model = robot.model
+    data = model.createData()
+    weight = robot.total_mass * model.gravity.linear
+    com = result.com
+    linear = robot.total_mass * result.com_velocity
+    states = zip(result.q, result.v, strict=True)
+    spin = [pin.computeCentroidalMomentum(model, data, *row).angular.copy() for row in states]
+    spin = np.array(spin) + np.cross(com, linear)
     pushes, arm = _pushes(result)
     pushed = result.q[:, :3] + rotations(result.q[:, 3:7]) @ arm
     forces = result.foot_wrench[:, :, :3]
@@ -223,8 +229,10 @@ def _steps(result: SimulationResult) -> tuple[np.ndarray, np.ndarray, np.ndarray
     model = result.robot.model
     # to the point of the base whose velocity the engine keeps, base axes
     arm = model.inertias[1].lever * engine.get("keeps_com", True)
-    pairs = zip(result.q[:-1], result.q[1:], strict=True)
-    q = np.array([pin.interpolate(model, *pair, share) for pair in pairs])
+    q = result.q[:-1]
+    if share:
+        pairs = zip(q, result.q[1:], strict=True)
+        q = np.array([pin.interpolate(model, *pair, share) for pair in pairs])
     turns, turn = (rotations(x[:, 3:7]) for x in (result.q, q))
     spins = result.v[:, 3:6]
     # of the base's CoM, in world axes; then within the step, in base axes
