@@ -140,9 +140,8 @@ class Controller:
         self.forecast = Flight(robot, tape, ground) if flies else None
         self.landing = LandingController(robot, may_step=step, force_noise_n=hardware.force_noise_n)
         flip = is_flip(tape)
-        # other jumps land flat, within a centimetre or two of what was planned for them; a robot
-        # that stands on one foot does not fall onto the other
-        self.ahead = LandingAhead(robot, landing if flies else "spring", again=flip)
+        # a robot that stands on one foot does not fall onto the other
+        self.ahead = LandingAhead(robot, landing if flies else "spring")
         self._reaim = Reaim(robot, tape, legs_alone=flip) if reaim and flies else None
         self._shifts = reaim and flip
         size = self.landing.body.size
@@ -244,12 +243,7 @@ class Controller:
     def _land(self, since: int, state: State) -> Command:
         """The landing controller's torque, ``since`` touchdown in steps."""
         if self._decides(since):
-            landing = self.landing
-            q, v, _ = state
-            time = since * STEP_S
-            if self.ahead.again and self.ahead.followed == "planned" and not self.steps_s:
-                landing.reference = self.ahead.follow(time, q, v, landing.reference)
-            self._tau = landing.torque(time, q, v, state.wrench[:, 2])
+            self._tau = self.landing.torque(since * STEP_S, *state[:2], state.wrench[:, 2])
         return Command(tau=self._tau)
 
     def _decides(self, since: int) -> bool:
