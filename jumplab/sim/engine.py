@@ -191,7 +191,7 @@ class Engine(ABC):
 
     def step(self) -> None:
         """Advance by :data:`jumplab.sim.STEP_S`, with armature and friction of the motors."""
-        state = self.state()
+        state = self._now or self._read()
         self._advance()
         self._now = None
         self._steps.append((*state, self.applied()))
