@@ -199,11 +199,12 @@ def _momentum_unexplained(result: SimulationResult) -> np.ndarray:
     model = robot.model
     data = model.createData()
     weight = robot.total_mass * model.gravity.linear
-    com = result.com
-    linear = robot.total_mass * result.com_velocity
-    states = zip(result.q, result.v, strict=True)
-    spin = [pin.computeCentroidalMomentum(model, data, *row).angular.copy() for row in states]
-    spin = np.array(spin) + np.cross(com, linear)
+    rows = []
+    for state in zip(result.q, result.v, strict=True):
+        momentum = pin.computeCentroidalMomentum(model, data, *state).vector
+        rows.append((data.com[0].copy(), momentum[:3], momentum[3:]))
+    com, linear, spin = np.array(rows).swapaxes(0, 1)
+    spin = spin + np.cross(com, linear)
     pushes, arm = _pushes(result)
     pushed = result.q[:, :3] + rotations(result.q[:, 3:7]) @ arm
     forces = result.foot_wrench[:, :, :3]
