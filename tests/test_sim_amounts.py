@@ -207,29 +207,6 @@ def test_forces_count_by_their_mean_over_a_tenth_of_a_second():
     assert worst(edge) == pytest.approx(1.0)
 
 
-def test_an_impact_within_a_step_is_no_jump_of_the_state():
-    """A heel that hits first turns the ankle, a toe that hits next turns it back: as far as forces can, and no more."""
-    name, ankle, row = "largest jump of the state", 7 + JOINTS.index("left_ankle_pitch"), 2
-    hit, still = np.zeros((6, 2, 6)), run(substeps=4)
-    hit[row, 0, 2] = 20e3
-    data, frame = MODEL.createData(), MODEL.getFrameId(ROBOT.foot.frames[0])
-    mass, axes = pin.crba(MODEL, data, still.q[row]), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    jacobian = pin.computeFrameJacobian(MODEL, data, still.q[row], frame, axes)
-    mass = np.triu(mass) + np.triu(mass, 1).T
-    kicks = [
-        np.linalg.solve(mass, H * jacobian.T @ [0, 0, 20e3, 0, -x * 20e3, 0]) for x in (ROBOT.foot.heel, ROBOT.foot.toe)
-    ]
-    may = 0.75 * H * np.abs(kicks).max(axis=0)[ankle - 1]
-    for moved, left in ((0.9 * may, 0.0), (may + 0.01, 0.01)):
-        q = still.q.copy()
-        q[row + 1 :, ankle] += moved
-        assert said(replace(still, q=q, foot_wrench=hit))[name] == pytest.approx(left, abs=1e-6)
-        assert said(replace(still, q=q))[name] == pytest.approx(moved)
-    q = still.q.copy()
-    q[row + 1 :, 2] += 0.05  # nor does it lift the robot
-    assert said(replace(still, q=q, foot_wrench=hit))[name] > 0.01
-
-
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_jumps_of_the_state(substeps):
     """A state that its velocities lead to, and one that is beyond; what swings within that step is allowed for."""

@@ -120,8 +120,14 @@ class Gauge:
 
     def places(self, q: np.ndarray) -> list[pin.SE3]:
         """Placements of both feet in ``q`` (nq,)."""
-        pin.framesForwardKinematics(self.model, self.data, q)
-        return [self.data.oMf[frame].copy() for frame in self.frames]
+        model = self.model
+        data = self.data
+        pin.forwardKinematics(model, data, q)
+        return [pin.updateFramePlacement(model, data, frame).copy() for frame in self.frames]
+
+    def feet(self, q: np.ndarray) -> np.ndarray:
+        """Homogeneous transforms (N, 2, 4, 4) of both feet in ``q`` (N, nq) [m]."""
+        return np.array([[foot.homogeneous for foot in self.places(row)] for row in q])
 
     def soles(self, q: np.ndarray) -> np.ndarray:
         """Mean of both soles' middles (3,) in ``q`` (nq,) [m]."""

@@ -1,7 +1,7 @@
 """Landing controller: a whole-body QP in torque mode, entered at touchdown.
 
 The paper lands with the controller of an earlier paper of its authors (Sec. VI-A) and does not
-repeat it. Here, every 2 ms, joint accelerations and foot wrenches are chosen that obey the base
+repeat it. Here, every 4 ms, joint accelerations and foot wrenches are chosen that obey the base
 dynamics, friction, the soles' edges and the motors' torques, and come closest to a list of wishes:
 CoM, angular momentum, trunk, feet flat and still, posture.
 """
@@ -45,7 +45,7 @@ MAX_BACK = 3.0
 MAX_STEP = 150.0  # [m/s^2] of a foot that steps: 0.5 m in 0.24 s begin with 50
 # [0.1 mN m] ProxQP's last digits depend on where its memory lies; rounded, runs are the same
 TORQUE_DIGITS = 4
-FALLBACK_DAMPING = 3.0  # [N m s/rad] stable at 500 Hz on the lightest joint
+FALLBACK_DAMPING = 1.5  # [N m s/rad] stable at 250 Hz on the lightest joint
 
 
 @dataclass(frozen=True)

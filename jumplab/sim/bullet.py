@@ -40,7 +40,7 @@ HARD = Contact({"numSolverIterations": 1000, "contactERP": 0.1, "contactSlop": 1
 # friction combines as a product: the robot's coefficient is the effective one
 GROUND_FRICTION = 1.0
 NOTHING = np.zeros((0, 16))  # what is noted of points on which ground presses, where it does not
-NOWHERE = np.tile(np.eye(7)[6], (2, 1))  # places and attitudes of the feet, where nothing presses
+NOWHERE = [(0.0,) * 6 + (1.0,)] * 2  # places and attitudes of the feet, where nothing presses
 FASTEST = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
 
 
@@ -126,9 +126,9 @@ def base_from_bullet(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
     attitude = rotation(quaternion)
-    arm = attitude @ lever
-    twist = np.array([velocity - moments(rate, arm), rate]) @ attitude
-    return np.concatenate([position - arm, quaternion]), twist.ravel()
+    twist = np.array([velocity, rate]) @ attitude
+    twist[0] += pin.skew(lever) @ twist[1]
+    return np.concatenate([position - attitude @ lever, quaternion]), twist.ravel()
 
 
 class BulletEngine(Engine):
@@ -256,9 +256,10 @@ class BulletEngine(Engine):
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
         pose = self._bullet.getBasePositionAndOrientation(self._body)
         twist = self._bullet.getBaseVelocity(self._body)
-        base_q, base_v = base_from_bullet(*map(np.array, (*pose, *twist)), self._lever)
+        base_q, base_v = base_from_bullet(*pose, *twist, self._lever)
         rows = self._bullet.getJointStates(self._body, self._joints)
-        angles, rates = np.array([row[:2] for row in rows]).T
+        angles = [row[0] for row in rows]
+        rates = [row[1] for row in rows]
         return np.concatenate([base_q, angles]), np.concatenate([base_v, rates])
 
     def set_torque(self, tau: np.ndarray) -> None:
@@ -283,7 +284,7 @@ class BulletEngine(Engine):
             moment = rotation(q[3:7]) @ returned[3:6]
             self._bullet.applyExternalTorque(self._body, -1, moment, bullet.WORLD_FRAME)
         self._bullet.setJointMotorControlArray(
-            self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau
+            self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau.tolist()
         )
         self._bullet.stepSimulation()
         self._note()
@@ -295,23 +296,19 @@ class BulletEngine(Engine):
 
     def _note(self) -> None:
         """Note all points on which ground presses, and where the feet are."""
-        points = []
-        colliding = False
-        for row in self._bullet.getContactPoints(bodyA=self._body):
-            _, _, other, link, _, place, _, normal, _, *forces = row
-            pressure, first, along, second, across = forces
-            if pressure <= 0:
-                continue
-            if other == self._body:
-                colliding = True
-                continue
-            points.append((link, pressure, first, second, *place, *normal, *along, *across))
+        # of a row: body and link that it touches, place, normal, pressure, friction along two axes
+        rows = [row for row in self._bullet.getContactPoints(bodyA=self._body) if row[9] > 0]
+        points = [
+            (row[3], row[9], row[10], row[12], *row[5], *row[7], *row[11], *row[13])
+            for row in rows
+            if row[2] != self._body
+        ]
         self.fallen = any(point[0] not in self._feet for point in points)
         feet = NOWHERE
         if points:
             states = [self._bullet.getLinkState(self._body, foot) for foot in self._feet]
-            feet = np.array([(*state[4], *state[5]) for state in states])
-        self._notes.append((np.array(points) if points else NOTHING, colliding, feet))
+            feet = [state[4] + state[5] for state in states]
+        self._notes.append((np.array(points) if points else NOTHING, len(points) < len(rows), feet))
 
     def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
         step, link, arm, force, _ = self._presses(notes)

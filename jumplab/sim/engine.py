@@ -25,7 +25,7 @@ from jumplab.sim.scene import Contacts, Scene
 MASS_KG = 1e-6
 ROUNDING = 1e-9
 SOLE_POINTS = 8  # contact points of two flat rectangular soles
-NEXT, LAST = [1, 2, 0], [2, 0, 1]  # axes
+NEXT, LAST = np.array([[1, 2, 0], [2, 0, 1]])  # axes
 TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
 
 
@@ -191,7 +191,7 @@ class Engine(ABC):
 
     def step(self) -> None:
         """Advance by :data:`jumplab.sim.STEP_S`, with armature and friction of the motors."""
-        state = self.state()
+        state = self._now or self._read()
         self._advance()
         self._now = None
         self._steps.append((*state, self.applied()))

@@ -173,8 +173,7 @@ class SimulationResult(Shown, Named):
     @cached_property
     def feet(self) -> np.ndarray:
         """(N, 2, 4, 4) homogeneous transforms of both foot links [m]."""
-        gauge = Gauge(self.robot)
-        return np.array([[foot.homogeneous for foot in gauge.places(q)] for q in self.q])
+        return Gauge(self.robot).feet(self.q)
 
     @cached_property
     def stray(self) -> np.ndarray:
