@@ -31,7 +31,7 @@ PERTURBED = Path(__file__).with_name("schedules_perturbed.jsonl")
 ROBOTS = "bhr", "g1_arms"
 RISE_M = 0.1  # of the jumps whose distance is a record
 PATIENCE_S = 40.0  # processor time for one plan
-# name -> words of Contacts.named
+# name -> words of Contacts.named, or a target
 CASES = {
     "hop 0.1 m": "hop=0.1",
     "hop 0.2 m": "hop=0.2",
@@ -42,6 +42,7 @@ CASES = {
     "drop jump 0.2 m": "drop_jump=0.2",
     "hurdle": "hurdle",
     "five bounds": "bound=5",
+    "target 0.5 m after a run-up": jl.JumpTask(0.5, RISE_M, takeoff="left", run_up=2),
 }
 WORLDS = {
     "PyBullet": dict(engine="bullet"),
@@ -91,19 +92,23 @@ def _row(folder: Path, robot: str, case: str) -> dict[str, Any]:
 
 
 def perturbed(folder: str | Path, n: int = 30, path: Path = PERTURBED, robots: Iterable[str] = ROBOTS) -> None:
-    """Let ``n`` perturbed robots play each plan that :func:`study` kept in ``folder``, in each engine; one row each.
+    """Let ``n`` perturbed robots play each plan that :func:`study` kept in ``folder``, an equal part of them in each
+    engine; one row each.
 
     Trials of a plan are kept beside it: an interrupted run, or one of more robots, goes on where the other ended.
     ``python -m paper.schedules DIR N`` calls it.
     """
+    engines = sim.INSTALLED
     with logs.keep(path, itemgetter("robot", "case", "engine", "n")) as log:
-        for robot, case, engine in product(robots, CASES, sim.INSTALLED):
+        for robot, case, (seed, engine) in product(robots, CASES, enumerate(engines)):
             place = Path(folder) / f"{robot} {case}"
-            if (robot, case, engine, n) in log.done or not (place / "plan.npz").is_file():
+            part = n // len(engines)
+            if (robot, case, engine, part) in log.done or not (place / "plan.npz").is_file():
                 continue
             settings = trials.TrialSettings(engine=engine)
-            report = trials.run_trials(place, n, settings=settings, jobs=1, progress=False)
-            row = {"robot": robot, "case": case, "engine": engine, "n": n, "landed": report.landed}
+            # other robots in each engine, which by its seed are the same in every case
+            report = trials.run_trials(place, part, seed, settings, jobs=1, progress=False)
+            row = {"robot": robot, "case": case, "engine": engine, "n": part, "landed": report.landed}
             log.add(row | {"causes": report.causes})
 
 
@@ -124,10 +129,11 @@ def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = RO
             log.add(row | {"cpu_s": round(time.process_time() - began, 1), "line": found.line()})
 
 
-def _planned(folder: Path, robot: str, words: str) -> JumpPlan:
+def _planned(folder: Path, robot: str, asked: str | jl.JumpTask) -> JumpPlan:
     if (folder / "plan.npz").is_file():
         return jl.load(folder).plan
-    plan = jl.plan(robot=robot, contacts=words, patience_s=PATIENCE_S)
+    given = {"contacts": asked} if isinstance(asked, str) else {"task": asked}
+    plan = jl.plan(**given, robot=robot, patience_s=PATIENCE_S)
     jl.save(folder, plan)
     return plan
 
