@@ -113,11 +113,14 @@ def perturbed(folder: str | Path, n: int = 30, path: Path = PERTURBED, robots: I
 
 
 def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = ROBOTS) -> None:
-    """The longest standing jump with a rise of :data:`RISE_M`, and the longest flight with it off one foot after a
-    run-up of two steps; one row each, plans kept in ``folder``. ``python -m paper.schedules DIR records`` calls it.
+    """The longest standing jump with a rise of :data:`RISE_M`, and the longest flights with it off one foot, from a
+    stand and after a run-up of two steps; one row each, plans kept in ``folder``.
+
+    ``python -m paper.schedules DIR records`` calls it.
     """
     stand = jl.JumpTask(0.0, RISE_M)
-    asked = {"stand": stand, "run-up": replace(stand, takeoff="left", run_up=2)}
+    hop = replace(stand, takeoff="left")
+    asked = {"stand": stand, "hop": hop, "run-up": replace(hop, run_up=2)}
     with logs.keep(path, itemgetter("robot", "from")) as log:
         for robot, name in product(robots, asked):
             if (robot, name) in log.done:
