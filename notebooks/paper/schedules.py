@@ -147,7 +147,8 @@ def stored(path: Path = LOG) -> list[dict[str, Any]]:
 
 
 def table(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line per case: what was planned, and how it ended in each world."""
+    """A line per case: what was planned, how it ended in each world, and how many perturbed robots stand."""
+    most = {(x["robot"], x["case"], x["engine"]): x for x in sorted(stored(PERTURBED), key=itemgetter("n"))}
     lines = []
     for row in rows:
         line = {"robot": row["robot"], "case": row["case"], "planned": "yes" if row["planned"] else "no"}
@@ -155,7 +156,11 @@ def table(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
             line |= {"CPU [s]": row["cpu_s"], "audit": ", ".join(row["failed_checks"]) or "passed"}
             line |= {"travel [m]": row["travel_m"], "rise [m]": row["rise_m"]}
         ends = row.get("runs", {}).items()
-        lines.append(line | {world: "stands" if run["stands"] else "falls" for world, run in ends})
+        line |= {world: "stands" if run["stands"] else "falls" for world, run in ends}
+        drawn = [x for (*key, _), x in most.items() if key == [row["robot"], row["case"]]]
+        if drawn:
+            line["perturbed"] = f"{sum(x['landed'] for x in drawn)} of {sum(x['n'] for x in drawn)}"
+        lines.append(line)
     return lines
 
 
