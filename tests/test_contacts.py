@@ -255,6 +255,20 @@ def test_refused(make, sentence):
     assert str(e.value) == sentence
 
 
+def test_a_flight_onto_lower_ground_lasts_as_long_as_its_fall(bhr):
+    """With the speed at take-off of a level flight; its longest time is longer as well, other flights stay."""
+    level = Contacts.hop(bhr).phases[3]
+    speed = bhr.gravity * level.guess_s / 2
+    for schedule in (Contacts.step_off(bhr, 0.3), Contacts.drop_jump(bhr, 0.3)):
+        down = schedule.phases[3]
+        fallen = speed * down.guess_s - bhr.gravity * down.guess_s**2 / 2
+        assert fallen == pytest.approx(-0.3)
+        assert down.time_s[0] == level.time_s[0]
+        assert down.time_s[1] - level.time_s[1] == pytest.approx(down.guess_s - level.guess_s)
+    again = Contacts.drop_jump(bhr, 0.3).phases[6]
+    assert (again.time_s, again.guess_s) == (level.time_s, level.guess_s)
+
+
 def test_eased_there_is_less_to_do():
     robot = Robot.load("bhr")
     off = Contacts.step_off(robot, 0.3)

@@ -31,7 +31,7 @@ PERTURBED = Path(__file__).with_name("schedules_perturbed.jsonl")
 ROBOTS = "bhr", "g1_arms"
 RISE_M = 0.1  # of the jumps whose distance is a record
 PATIENCE_S = 40.0  # processor time for one plan
-# name -> words of Contacts.named
+# name -> words of Contacts.named, or a target
 CASES = {
     "hop 0.1 m": "hop=0.1",
     "hop 0.2 m": "hop=0.2",
@@ -42,6 +42,7 @@ CASES = {
     "drop jump 0.2 m": "drop_jump=0.2",
     "hurdle": "hurdle",
     "five bounds": "bound=5",
+    "target 0.5 m after a run-up": jl.JumpTask(0.5, RISE_M, takeoff="left", run_up=2),
 }
 WORLDS = {
     "PyBullet": dict(engine="bullet"),
@@ -91,28 +92,35 @@ def _row(folder: Path, robot: str, case: str) -> dict[str, Any]:
 
 
 def perturbed(folder: str | Path, n: int = 30, path: Path = PERTURBED, robots: Iterable[str] = ROBOTS) -> None:
-    """Let ``n`` perturbed robots play each plan that :func:`study` kept in ``folder``, in each engine; one row each.
+    """Let ``n`` perturbed robots play each plan that :func:`study` kept in ``folder``, an equal part of them in each
+    engine; one row each.
 
     Trials of a plan are kept beside it: an interrupted run, or one of more robots, goes on where the other ended.
     ``python -m paper.schedules DIR N`` calls it.
     """
+    engines = sim.INSTALLED
     with logs.keep(path, itemgetter("robot", "case", "engine", "n")) as log:
-        for robot, case, engine in product(robots, CASES, sim.INSTALLED):
+        for robot, case, (seed, engine) in product(robots, CASES, enumerate(engines)):
             place = Path(folder) / f"{robot} {case}"
-            if (robot, case, engine, n) in log.done or not (place / "plan.npz").is_file():
+            part = n // len(engines)
+            if (robot, case, engine, part) in log.done or not (place / "plan.npz").is_file():
                 continue
             settings = trials.TrialSettings(engine=engine)
-            report = trials.run_trials(place, n, settings=settings, jobs=1, progress=False)
-            row = {"robot": robot, "case": case, "engine": engine, "n": n, "landed": report.landed}
+            # other robots in each engine, which by its seed are the same in every case
+            report = trials.run_trials(place, part, seed, settings, jobs=1, progress=False)
+            row = {"robot": robot, "case": case, "engine": engine, "n": part, "landed": report.landed}
             log.add(row | {"causes": report.causes})
 
 
 def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = ROBOTS) -> None:
-    """The longest standing jump with a rise of :data:`RISE_M`, and the longest flight with it off one foot after a
-    run-up of two steps; one row each, plans kept in ``folder``. ``python -m paper.schedules DIR records`` calls it.
+    """The longest standing jump with a rise of :data:`RISE_M`, and the longest flights with it off one foot, from a
+    stand and after a run-up of two steps; one row each, plans kept in ``folder``.
+
+    ``python -m paper.schedules DIR records`` calls it.
     """
     stand = jl.JumpTask(0.0, RISE_M)
-    asked = {"stand": stand, "run-up": replace(stand, takeoff="left", run_up=2)}
+    hop = replace(stand, takeoff="left")
+    asked = {"stand": stand, "hop": hop, "run-up": replace(hop, run_up=2)}
     with logs.keep(path, itemgetter("robot", "from")) as log:
         for robot, name in product(robots, asked):
             if (robot, name) in log.done:
@@ -124,10 +132,11 @@ def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = RO
             log.add(row | {"cpu_s": round(time.process_time() - began, 1), "line": found.line()})
 
 
-def _planned(folder: Path, robot: str, words: str) -> JumpPlan:
+def _planned(folder: Path, robot: str, asked: str | jl.JumpTask) -> JumpPlan:
     if (folder / "plan.npz").is_file():
         return jl.load(folder).plan
-    plan = jl.plan(robot=robot, contacts=words, patience_s=PATIENCE_S)
+    given = {"contacts": asked} if isinstance(asked, str) else {"task": asked}
+    plan = jl.plan(**given, robot=robot, patience_s=PATIENCE_S)
     jl.save(folder, plan)
     return plan
 
@@ -138,7 +147,8 @@ def stored(path: Path = LOG) -> list[dict[str, Any]]:
 
 
 def table(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line per case: what was planned, and how it ended in each world."""
+    """A line per case: what was planned, how it ended in each world, and how many perturbed robots stand."""
+    most = {(x["robot"], x["case"], x["engine"]): x for x in sorted(stored(PERTURBED), key=itemgetter("n"))}
     lines = []
     for row in rows:
         line = {"robot": row["robot"], "case": row["case"], "planned": "yes" if row["planned"] else "no"}
@@ -146,7 +156,11 @@ def table(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
             line |= {"CPU [s]": row["cpu_s"], "audit": ", ".join(row["failed_checks"]) or "passed"}
             line |= {"travel [m]": row["travel_m"], "rise [m]": row["rise_m"]}
         ends = row.get("runs", {}).items()
-        lines.append(line | {world: "stands" if run["stands"] else "falls" for world, run in ends})
+        line |= {world: "stands" if run["stands"] else "falls" for world, run in ends}
+        drawn = [x for (*key, _), x in most.items() if key == [row["robot"], row["case"]]]
+        if drawn:
+            line["perturbed"] = f"{sum(x['landed'] for x in drawn)} of {sum(x['n'] for x in drawn)}"
+        lines.append(line)
     return lines
 
 

@@ -301,7 +301,23 @@ class Contacts:
 
         Raises :class:`InputError` as the class does, as all below.
         """
-        return cls(tuple(ContactPhase.usual(f, robot) for f in feet.split()), tuple(places), ends)
+        phases = tuple(ContactPhase.usual(f, robot) for f in feet.split())
+        return cls(phases, tuple(places), ends)._falling(robot.gravity)
+
+    def _falling(self, gravity: float) -> Contacts:
+        """The same whose flight onto lower ground takes the time of the fall; a guess of a level
+        flight sends the solver astray.
+        """
+        height, first = self.surface
+        if height >= 0:
+            return self
+        k, _ = self.landings[len(self.first) + first]
+        p = self.phases[k - 1]
+        half = p.guess_s / 2
+        more_s = math.sqrt(half**2 - 2 * height / gravity) - half
+        low, high = p.time_s
+        longer = replace(p, guess_s=p.guess_s + more_s, time_s=(low, high + more_s))
+        return replace(self, phases=(*self.phases[: k - 1], longer, *self.phases[k:]))
 
     @classmethod
     def hop(

@@ -57,8 +57,6 @@ IPOPT |= {
 }
 # where the Hessian is indefinite, what is added to it should be close to what the last step needed
 IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
-# added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
-HOLD = 0.1
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 # of all attempts for one target, in processor time: beyond, no other start and no finer mesh is
 # tried; on a busy core a hop, which has to be solved on a finer mesh with its links apart, takes 20
@@ -211,12 +209,13 @@ class Program(Shown):
         """
         limit_s = most_s
         inside = INSIDE if self.follows else {}
+        hold = start.hold if start.held else None
         while True:
             began = time.thread_time()
             limit = {"max_iter": start.patience, "max_cpu_time": limit_s}
             options = {**IPOPT, **inside, **start.options, **limit, **self.options}
             try:
-                return built.with_options(options, HOLD if start.held else None).solve(**given)
+                return built.with_options(options, hold).solve(**given)
             except SolverError as e:
                 own_s = time.thread_time() - began
                 if e.status != OUT_OF_TIME or own_s > OWN_SHARE * most_s:

@@ -28,6 +28,11 @@ NEAR |= {"acceptable_constr_viol_tol": 9e-5}
 # where a motion passes limits between the nodes, it often is not settled: from there on with
 # smaller steps of the cost
 PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
+# added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
+HOLD = 0.1
+# more of it, for shorter steps where rows would swing about their limits
+SHORTER = 0.3
+SHORTEST = 1.0
 
 
 @dataclass(frozen=True)
@@ -108,6 +113,7 @@ class Start:
     patience : iterations after which it is given up, so that a busy machine finds the same plan;
         their processor time has a bound as well, see :meth:`.Program.solve`.
     options : of ipopt besides the usual ones.
+    hold : what is added to the held Hessian [1]: with more of it steps are shorter.
     """
 
     name: str
@@ -115,6 +121,7 @@ class Start:
     held: bool
     patience: int
     options: Mapping[str, Any] = field(default_factory=dict)
+    hold: float = HOLD
 
     @property
     def hessian(self) -> str:
@@ -285,9 +292,10 @@ APART = (
     Start("links apart", from_neighbour, False, 120, MET),
 )
 STILL = replace(COLD[-1], name="links apart as before")
-# from a rough solution with the held Hessian
+# from a rough solution with the held Hessian; with less hold the G1 takes a hundred iterations
 HELD_AFTER_ROUGH = tuple(
-    Start("links apart", from_neighbour, True, 100, NEAR | {"mu_init": mu}) for mu in (1e-3, 3e-4)
+    Start("links apart", from_neighbour, True, 100, NEAR | {"mu_init": mu}, hold)
+    for mu, hold in ((1e-3, SHORTER), (3e-4, SHORTEST))
 )
 # with the exact one, further inside the limits with a higher barrier; then from what came of it
 STEPPED = MET | {"mu_strategy": "monotone"}
@@ -304,6 +312,6 @@ SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
 FINER = Start("finer mesh", from_neighbour, False, 150, WARM | {"acceptable_iter": 1})
 # of schedules, in half of the time of the exact Hessian
 CLOSER = {"mu_init": 1e-4, "acceptable_iter": 5, "acceptable_obj_change_tol": 5e-4}
-HELD_SETTLED = replace(SETTLED, held=True, patience=60, options=NEAR | CLOSER)
-REFINED_ALONG = (HELD_SETTLED, SETTLED, FINER, FINER)
+HELD_SETTLED = replace(SETTLED, held=True, patience=40, options=NEAR | CLOSER)
+REFINED_ALONG = (HELD_SETTLED, replace(HELD_SETTLED, hold=SHORTEST), SETTLED, FINER, FINER)
 REFINED = (SETTLED, FINER, FINER, FINER)  # the last one for flips of robots with a waist
