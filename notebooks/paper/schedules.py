@@ -17,17 +17,20 @@ from scipy.integrate import trapezoid
 
 import jumplab as jl
 from jumplab import sim
+from jumplab.control import STEP_S
 from jumplab.errors import SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, by_phase, new_figure
+from jumplab.sim import SLIGHT
 from jumplab.stages.plan import JumpPlan, planned
-from jumplab.studies import trials
+from jumplab.studies import chain, trials
 from paper import logs
 
 LOG = Path(__file__).with_name("schedules.jsonl")
 LONGEST = Path(__file__).with_name("run_up_records.jsonl")
 PERTURBED = Path(__file__).with_name("schedules_perturbed.jsonl")
+BOUNDS = Path(__file__).with_name("schedules_bounds.jsonl")
 ROBOTS = "bhr", "g1_arms"
 RISE_M = 0.1  # of the jumps whose distance is a record
 PATIENCE_S = 40.0  # processor time for one plan
@@ -132,6 +135,39 @@ def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = RO
             log.add(row | {"cpu_s": round(time.process_time() - began, 1), "line": found.line()})
 
 
+def bounds(folder: str | Path, n: int = 10, path: Path = BOUNDS) -> None:
+    """Five bounds of ``bhr`` as one program, which :func:`study` kept in ``folder``, against five jumps of the same
+    travel and rise, each planned again on the way; one row each, with ``n`` slightly perturbed robots.
+
+    ``python -m paper.schedules DIR bounds`` calls it.
+    """
+    place = Path(folder) / "bhr five bounds"
+    plan = jl.load(place).plan
+    rises = [plan.com_velocity[flight.start, 2] ** 2 / (2 * plan.robot.gravity) for flight in plan.tape.flights]
+    course = chain.Course.of([plan.planned_distance_m / len(rises)] * len(rises), rises)
+    with logs.keep(path, itemgetter("how")) as log:
+        if "one program" not in log.done:
+            settings = trials.TrialSettings(ranges=SLIGHT, noise=sim.SensorNoise())
+            report = trials.run_trials(place, n, settings=settings, jobs=1, progress=False)
+            row = {"how": "one program", "cpu_s": [x.cpu_s for x in plan.attempts]}
+            log.add(row | _worked([jl.simulate(plan)]) | {"stand": report.landed, "of": n})
+        if "planned again" not in log.done:
+            result = jl.run_chain(course, plan.robot)
+            series = chain.run_chains(course, plan.robot, n, jobs=1)
+            row = {"how": "planned again", "cpu_s": [x.cpu_s for x in result.replans]}
+            worked = _worked([jump.simulation for jump in result.jumps])
+            log.add(row | worked | {"stand": series["stood"], "of": n})
+
+
+def _worked(runs: list[sim.SimulationResult]) -> dict[str, float]:
+    """Time [s] and work of the motors [J], braking not counted, from the start to the last touchdown."""
+    *before, last = runs
+    until = [len(run.t) for run in before] + [int(np.searchsorted(last.t, last.metrics.touchdown_s))]
+    power = (np.maximum(run.tau * run.v[:, 6:], 0)[:end] for run, end in zip(runs, until, strict=True))
+    work = sum(trapezoid(x.sum(axis=1), dx=STEP_S) for x in power)
+    return {"time_s": STEP_S * sum(until), "work_j": float(work)}
+
+
 def _planned(folder: Path, robot: str, asked: str | jl.JumpTask) -> JumpPlan:
     if (folder / "plan.npz").is_file():
         return jl.load(folder).plan
@@ -196,6 +232,8 @@ def speeds(plans: dict[str, JumpPlan]) -> Figure:
 if __name__ == "__main__":
     if sys.argv[2:] == ["records"]:
         records(sys.argv[1])
+    elif sys.argv[2:] == ["bounds"]:
+        bounds(sys.argv[1])
     elif sys.argv[2:]:
         perturbed(sys.argv[1], int(sys.argv[2]))
     else:
