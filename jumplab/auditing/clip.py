@@ -145,7 +145,11 @@ def _judged(clip: Clip) -> ClipReport:
     tape = dataclasses.replace(tape, tau=r.tau)
     r = dataclasses.replace(r, tape=tape)
     falls = _free_falls(r, ground)
-    measures = [*_measures(r, ground, falls), *map(_lasting(clip.fps), joints(r)), *collisions(r)]
+    measures = [
+        *_measures(r, ground, level, falls),
+        *map(_lasting(clip.fps), joints(r)),
+        *collisions(r),
+    ]
     checks = _checks(measures, LIMITS | LASTING)
     checks = tuple(c for c in checks if c.name != "body clearance")
     manifest = {
@@ -298,8 +302,10 @@ def _pushes(r: Replay, k: int, sides: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 # measures
 # ----------------------------------------------------------------------------------------------
-def _measures(r: Replay, ground: np.ndarray, falls: list[Fall]) -> Iterator[Measure]:
-    """Measures of the group "clip"."""
+def _measures(
+    r: Replay, ground: np.ndarray, level: np.ndarray, falls: list[Fall]
+) -> Iterator[Measure]:
+    """Measures of the group "clip"; ``level`` (n, 2) is how high each foot would stand [m]."""
     t = r.tape.t
     feet = r.tape.contact_frames
     height = r.sole_points[..., 2].min(axis=2)
@@ -307,7 +313,8 @@ def _measures(r: Replay, ground: np.ndarray, falls: list[Fall]) -> Iterator[Meas
     floating = np.where(standing, height, -np.inf)
     yield "standing feet float", *_most(floating, t, METHOD.float_percent), feet
     yield "feet in the ground", -height, t, feet
-    yield "feet on the ground slide", *_most(_sliding(r, standing), t, METHOD.slide_percent), feet
+    near = standing & (height - level < METHOD.near_m)
+    yield "feet on the ground slide", *_most(_sliding(r, near), t, METHOD.slide_percent), feet
     off = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
     yield "flights fall freely", off, [times[0] for times, _, _ in falls]
     missing = norm(r.base_residual[:, :3]) / r.weight

@@ -7,7 +7,6 @@ floor from the soles that stand, and how long phases last is free.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -67,7 +66,6 @@ FADE_S = 0.2  # in which a leg in the air leaves what holds its foot in place, o
 LEAST_RISE_M = 0.02  # of a clip's flight, to be scaled
 RISE_WEIGHT = 1e5  # [1] / [m/s]^2, of the take-off speed that a target asks for
 FACTORS = (0.8, 0.6, 0.4)  # of what cannot be mended
-NEAR = 1e-3  # of a limit's size: it binds
 
 
 @dataclass(frozen=True, repr=False)
@@ -216,7 +214,7 @@ def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended
     draft = Draft(before, factor)
     plan = planner.follow(draft.contacts, motion=draft.motion, stance=draft.start)
     rows = tuple(_changes(before, draft, plan))
-    return Mended(plan, before, rows, _binding(plan), factor, draft.span_s)
+    return Mended(plan, before, rows, plan.whole_body.binding, factor, draft.span_s)
 
 
 def spans(flags: np.ndarray) -> list[list[int]]:
@@ -602,14 +600,3 @@ def _changes(before: ClipReport, draft: Draft, plan: JumpPlan) -> list[dict[str,
             row = {"what": what.format(i), "clip": clip, "mended": float(mended)}
             rows.append(row | {"change": row["mended"] - clip})
     return rows
-
-
-def _binding(plan: JumpPlan) -> tuple[str, ...]:
-    """Limits that bind, by what they are worth: the sum of their multipliers."""
-    worth: Counter[str] = Counter()
-    solution = plan.whole_body.solution
-    kinds = {(r["phase"], r["name"]): r["kind"] for r in solution.constraint_report}
-    for (owner, name), (_, values) in solution.multipliers.rows.items():
-        if kinds.get((owner, name)) == "inequality":
-            worth[name] += float(np.abs(values).sum())
-    return tuple(name for name, x in worth.most_common(5) if x > NEAR)
