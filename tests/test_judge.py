@@ -180,7 +180,7 @@ WRONG = {
     "no rate": (dict(fps=0), "says 0 frames per second"),
     "nan rate": (dict(fps=float("nan")), "says nan frames per second"),
     "back in time": (dict(fps=-30), "says -30 frames per second"),
-    "metres": (dict(root_trans_offset=100 * Q[:, :3]), "looks like centimetres: pass metres"),
+    "metres": (dict(root_trans_offset=100 * Q[:, :3]), "looks like cm or mm: pass metres"),
 }
 
 

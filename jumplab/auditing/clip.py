@@ -268,9 +268,9 @@ def _pushed(r: Replay, ground: np.ndarray) -> np.ndarray:
             shares, _ = nnls(rows, np.concatenate([asked, weights * goals]))
             left = needed - torques @ shares
             over = np.abs(left) > METHOD.torque_share
-            if not (over & (weights < 1)).any():
+            if not (over & (weights < METHOD.over_weight)).any():
                 break
-            weights[over] = 1.0
+            weights[over] = METHOD.over_weight
             goals[over] = (needed - METHOD.torque_share * np.sign(left))[over]
         for side, columns in zip(sides, np.split(np.arange(len(shares)), len(sides)), strict=True):
             f[k, side] = wrenches[:, columns] @ shares[columns]
