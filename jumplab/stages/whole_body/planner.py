@@ -212,6 +212,7 @@ class WholeBodyPlanner:
                 raise _farthest(failures)
             raise (explain and self._explained(programs[-1], asked)) or failures[-1]
         shares = shares_between(best.tape, self.robot, programs[-1].surface(task), self.body)
+        shares["distance of links"] = best.used  # the largest where links meet
         name = max(shares, key=shares.get)
         raise SolverError(
             f"{NAME}: motions that keep every limit at the nodes break that of {name} between "
