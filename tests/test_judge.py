@@ -101,6 +101,21 @@ def test_joints_beyond_their_ranges_are_found():
     assert values(replace(standing(), q=q))["joint range"] == pytest.approx(100, abs=0.1)
 
 
+@pytest.mark.parametrize("fps", [50, 100, 1000])
+def test_motors_that_are_too_weak_for_a_plan_are_found_at_usual_rates_and_no_others(fps):
+    def judged(effort):
+        clip = Clip.of(jump(0.6, 0.3), fps=fps)
+        return jl.judge(replace(clip, robot=clip.robot.with_limits(effort=effort)))
+
+    assert judged(0.6).passed and judged(1.0)["joint torque"].value == pytest.approx(55, abs=5)
+    assert {c.name for c in judged(0.4).failed} == {"joint torque", "torque at speed"}
+
+
+def test_a_foot_that_swings_low_over_the_ground_does_not_slide():
+    report = jl.judge(jl.plan(jl.JumpTask(-0.3, 0.2)), fps=1000)
+    assert report["feet on the ground slide"].passed, report.table()
+
+
 # files
 # ----------------------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", FILES)
@@ -180,7 +195,7 @@ WRONG = {
     "no rate": (dict(fps=0), "says 0 frames per second"),
     "nan rate": (dict(fps=float("nan")), "says nan frames per second"),
     "back in time": (dict(fps=-30), "says -30 frames per second"),
-    "metres": (dict(root_trans_offset=100 * Q[:, :3]), "looks like centimetres: pass metres"),
+    "metres": (dict(root_trans_offset=100 * Q[:, :3]), "looks like cm or mm: pass metres"),
 }
 
 

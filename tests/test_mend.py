@@ -168,8 +168,9 @@ def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
     mended = jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
     rows = {row["what"]: row for row in mended.changes}
     assert jl.audit(mended.plan).passed and not mended.before.passed
-    # differences of frames blur the landing's torques, and nothing else
-    assert {c.name for c in jl.judge(mended.plan).failed} <= {"joint torque", "torque at speed"}
+    for fps in (50, 100):
+        report = jl.judge(mended.plan, fps=fps)
+        assert report.passed, report.table()
     assert rows["joints, rms [rad]"]["change"] < 0.25 and rows["footholds, largest [m]"]["change"] < 0.07
     assert abs(rows["flight 1 [s]"]["change"]) < 0.15 * rows["flight 1 [s]"]["clip"]
     assert mended.binding and mended.factor == 1

@@ -5,7 +5,7 @@ code where that applies.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import compress, pairwise
 from pathlib import Path
@@ -19,7 +19,7 @@ from jumplab.auditing.audit import _checks
 from jumplab.auditing.contact import collisions
 from jumplab.auditing.dynamics import joints
 from jumplab.auditing.replay import Replay, norm, replay, runs
-from jumplab.auditing.report import METHOD, AuditReport, Measure
+from jumplab.auditing.report import LIMITS, METHOD, AuditReport, Measure
 from jumplab.errors import InputError, as_path
 from jumplab.io.clip import ENDINGS, Clip, read_clips
 from jumplab.io.folder import versions
@@ -28,6 +28,15 @@ from jumplab.robot import Robot
 
 SIDES = "LR"
 Fall = tuple[np.ndarray, np.ndarray, float]  # see _free_falls
+# limits that a clip passes if it is beyond them for some time, see _lasting
+LASTING = {
+    name: dataclasses.replace(
+        LIMITS[name],
+        limit=LIMITS[name].limit + METHOD.torque_room,
+        note=LIMITS[name].note + ", for {lasting_s:g} s",
+    )
+    for name in ("joint torque", "torque at speed")
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -136,7 +145,12 @@ def _judged(clip: Clip) -> ClipReport:
     tape = dataclasses.replace(tape, tau=r.tau)
     r = dataclasses.replace(r, tape=tape)
     falls = _free_falls(r, ground)
-    checks = _checks([*_measures(r, ground, falls), *joints(r), *collisions(r)])
+    measures = [
+        *_measures(r, ground, level, falls),
+        *map(_lasting(clip.fps), joints(r)),
+        *collisions(r),
+    ]
+    checks = _checks(measures, LIMITS | LASTING)
     checks = tuple(c for c in checks if c.name != "body clearance")
     manifest = {
         "clip": clip.name,
@@ -159,14 +173,19 @@ def _judged(clip: Clip) -> ClipReport:
     return report
 
 
+def _width(fps: float) -> float:
+    """Frames [1] over which rates are averaged."""
+    return min(METHOD.smoothing_s * fps, max(1.0, METHOD.rates_s * fps))
+
+
 def tape_of(clip: Clip) -> Tape:
-    """A clip as a tape, rates (n, nv) by differences over METHOD.smoothing_s, without forces."""
+    """A clip as a tape, rates (n, nv) by differences over METHOD.rates_s, without forces."""
     from scipy.ndimage import gaussian_filter1d  # slow to import
 
     model = clip.robot.model
     steps = [pin.difference(model, a, b) for a, b in pairwise(clip.q)]
     steps = np.array(steps) * clip.fps
-    width = METHOD.smoothing_s * clip.fps
+    width = _width(clip.fps)
     v = np.gradient(np.vstack([np.zeros_like(steps[:1]), np.cumsum(steps, axis=0)]), axis=0)
     v = gaussian_filter1d(v, width, axis=0, mode="nearest")
     a = np.gradient(v, 1 / clip.fps, axis=0)
@@ -223,43 +242,70 @@ def _drop(flags: np.ndarray, value: bool, least: int) -> None:
 
 
 def _pushed(r: Replay, ground: np.ndarray) -> np.ndarray:
-    """Wrenches (n, 2, 6) at the feet: what friction at the soles' corners can do for the base, and
-    with least torques.
+    """Wrenches (n, 2, 6) at the feet: what friction at the soles' corners can do for the base, with
+    torques within their limits if that can be, else least beyond them.
+
+    Rates are averages over some frames, so forces are: a foot may push that long before it lands
+    and after it leaves.
     """
+    from scipy.ndimage import maximum_filter1d  # slow to import
     from scipy.optimize import nnls  # slow to import
 
-    mu = METHOD.clip_friction
-    edges = np.array([[mu, 0, 1], [-mu, 0, 1], [0, mu, 1], [0, -mu, 1]])
-    corners = np.concatenate([r.toe_corners, r.heel_corners], axis=2)
-    effort = r.model.upperEffortLimit[6:, None]
-    data = r.model.createData()
-    frames = [r.model.getFrameId(str(name)) for name in r.tape.contact_frames]
+    width = _width(1 / np.median(np.diff(r.tape.t)))
+    ground = maximum_filter1d(ground, 2 * round(width) + 1, axis=0)
+    effort = r.model.upperEffortLimit[6:]
     f = np.zeros((*ground.shape, 6))
     for k in np.flatnonzero(ground.any(axis=1)):
-        pin.computeJointJacobians(r.model, data, r.tape.q[k])
-        columns = []
-        wrenches = []
-        for side in np.flatnonzero(ground[k]):
-            force = np.tile(edges, (corners.shape[2], 1))
-            arms = np.repeat(corners[k, side], len(edges), axis=0)
-            wrench = np.hstack([force, np.cross(arms - r.foot[k, side], force)]).T
-            slope = pin.getFrameJacobian(r.model, data, frames[side], pin.LOCAL_WORLD_ALIGNED)
-            base = np.vstack([force.T, np.cross(arms - r.com[k], force).T]) / r.weight
-            torques = METHOD.torque_weight * (slope.T @ wrench)[6:] / effort
-            columns.append(np.vstack([base, torques]))
-            wrenches.append(wrench)
-        asked = [r.base_residual[k] / r.weight, METHOD.torque_weight * r.tau[k] / effort[:, 0]]
-        shares, _ = nnls(np.hstack(columns), np.concatenate(asked))
-        parts = np.split(shares, len(wrenches))
-        for side, wrench, part in zip(np.flatnonzero(ground[k]), wrenches, parts, strict=True):
-            f[k, side] = wrench @ part
+        sides = np.flatnonzero(ground[k])
+        wrenches, base, torques = _pushes(r, k, sides)
+        torques /= effort[:, None]
+        asked = r.base_residual[k] / r.weight
+        needed = r.tau[k] / effort
+        weights = np.full(len(needed), METHOD.torque_weight)
+        goals = needed.copy()
+        for _ in range(METHOD.torque_rounds):
+            rows = np.vstack([base, weights[:, None] * torques])
+            shares, _ = nnls(rows, np.concatenate([asked, weights * goals]))
+            left = needed - torques @ shares
+            over = np.abs(left) > METHOD.torque_share
+            if not (over & (weights < METHOD.over_weight)).any():
+                break
+            weights[over] = METHOD.over_weight
+            goals[over] = (needed - METHOD.torque_share * np.sign(left))[over]
+        for side, columns in zip(sides, np.split(np.arange(len(shares)), len(sides)), strict=True):
+            f[k, side] = wrenches[:, columns] @ shares[columns]
     return f
+
+
+def _pushes(r: Replay, k: int, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pushes along the edges of the friction cones at the corners of the soles ``sides`` in sample
+    ``k``: wrenches (6, m) at the feet, the same about the CoM as shares of the weight (6, m), and
+    torques (nv - 6, m) that they spare [N m].
+    """
+    mu = METHOD.clip_friction
+    edges = np.array([[mu, 0, 1], [-mu, 0, 1], [0, mu, 1], [0, -mu, 1]])
+    data = r.model.createData()
+    pin.computeJointJacobians(r.model, data, r.tape.q[k])
+    parts = []
+    for side in sides:
+        corners = np.concatenate([r.toe_corners[k, side], r.heel_corners[k, side]])
+        force = np.tile(edges, (len(corners), 1))
+        arms = np.repeat(corners, len(edges), axis=0)
+        wrench = np.hstack([force, np.cross(arms - r.foot[k, side], force)]).T
+        frame = r.model.getFrameId(str(r.tape.contact_frames[side]))
+        slope = pin.getFrameJacobian(r.model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+        base = np.vstack([force.T, np.cross(arms - r.com[k], force).T]) / r.weight
+        parts.append((wrench, base, (slope.T @ wrench)[6:]))
+    wrenches, base, torques = (np.hstack(x) for x in zip(*parts, strict=True))
+    return wrenches, base, torques
 
 
 # measures
 # ----------------------------------------------------------------------------------------------
-def _measures(r: Replay, ground: np.ndarray, falls: list[Fall]) -> Iterator[Measure]:
-    """Measures of the group "clip"."""
+def _measures(
+    r: Replay, ground: np.ndarray, level: np.ndarray, falls: list[Fall]
+) -> Iterator[Measure]:
+    """Measures of the group "clip"; ``level`` (n, 2) is how high each foot would stand [m]."""
     t = r.tape.t
     feet = r.tape.contact_frames
     height = r.sole_points[..., 2].min(axis=2)
@@ -267,13 +313,30 @@ def _measures(r: Replay, ground: np.ndarray, falls: list[Fall]) -> Iterator[Meas
     floating = np.where(standing, height, -np.inf)
     yield "standing feet float", *_most(floating, t, METHOD.float_percent), feet
     yield "feet in the ground", -height, t, feet
-    yield "feet on the ground slide", *_most(_sliding(r, standing), t, METHOD.slide_percent), feet
+    near = standing & (height - level < METHOD.near_m)
+    yield "feet on the ground slide", *_most(_sliding(r, near), t, METHOD.slide_percent), feet
     off = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
     yield "flights fall freely", off, [times[0] for times, _, _ in falls]
     missing = norm(r.base_residual[:, :3]) / r.weight
     yield "unphysical force", *_most(missing, t, METHOD.force_percent)
     moment = norm(r.base_residual[:, 3:]) / r.weight
     yield "unphysical moment", *_most(moment, t, METHOD.force_percent)
+
+
+def _lasting(fps: float) -> Callable[[Measure], Measure]:
+    """What makes torque shares (n, joints) of a measure the least over METHOD.lasting_s around, of
+    others nothing.
+    """
+    from scipy.ndimage import minimum_filter1d  # slow to import
+
+    size = max(METHOD.lasting_frames, round(METHOD.lasting_s * fps))
+
+    def least(measure: Measure) -> Measure:
+        name, values, *more = measure
+        values = minimum_filter1d(values, size, axis=0) if name in LASTING else values
+        return name, values, *more
+
+    return least
 
 
 def _inner(ground: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -369,7 +369,7 @@ def _faults(raw: _Raw) -> Iterator[str]:
         yield f"joint angles up to {most:.0f}; they look like degrees: pass radians"
     away = np.abs(raw.base)
     if np.median(away.max(axis=1)) > 50:
-        yield f"the base is {away.max():.0f} m away; it looks like centimetres: pass metres"
+        yield f"the base is {away.max():.0f} m away; it looks like cm or mm: pass metres"
 
     def upright(turn: np.ndarray, axis: int = 2) -> float:
         return float(np.median(Rotation.from_quat(turn).as_matrix()[:, axis, 2]))

@@ -153,8 +153,11 @@ def _made(formulator: Formulator, part: Part, words: list, key: str | None) -> d
     if key is None:
         return formulator.formulas(part).functions()
 
+    fresh: dict[str, ca.Function] = {}
+
     def make() -> dict[str, str]:
-        return {name: f.serialize() for name, f in formulator.formulas(part).functions().items()}
+        fresh.update(formulator.formulas(part).functions())
+        return {name: f.serialize() for name, f in fresh.items()}
 
     texts = remembered(words, key, make)
-    return {name: ca.Function.deserialize(text) for name, text in texts.items()}
+    return fresh or {name: ca.Function.deserialize(text) for name, text in texts.items()}

@@ -7,7 +7,6 @@ floor from the soles that stand, and how long phases last is free.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -63,10 +62,10 @@ START_ROUNDS = 30
 BEGUN_OFF = 0.05  # [m, rad] by which a sole may miss its place as it begins
 START_ROOM_RAD = 0.01  # of the first posture to the stops
 SMOOTH_FRAMES = 3.0
+FADE_S = 0.2  # in which a leg in the air leaves what holds its foot in place, or comes to it
 LEAST_RISE_M = 0.02  # of a clip's flight, to be scaled
 RISE_WEIGHT = 1e5  # [1] / [m/s]^2, of the take-off speed that a target asks for
 FACTORS = (0.8, 0.6, 0.4)  # of what cannot be mended
-NEAR = 1e-3  # of a limit's size: it binds
 
 
 @dataclass(frozen=True, repr=False)
@@ -215,7 +214,7 @@ def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended
     draft = Draft(before, factor)
     plan = planner.follow(draft.contacts, motion=draft.motion, stance=draft.start)
     rows = tuple(_changes(before, draft, plan))
-    return Mended(plan, before, rows, _binding(plan), factor, draft.span_s)
+    return Mended(plan, before, rows, plan.whole_body.binding, factor, draft.span_s)
 
 
 def spans(flags: np.ndarray) -> list[list[int]]:
@@ -444,7 +443,28 @@ class Draft:
         start = drawn[0][0] = self._start(drawn[0][0])
         self.start = configurations(self.body.model, start[None])[0]
         durations = np.array([p.guess_s for p in self.contacts.phases])
-        return Motion(durations, drawn, missed)
+        motion = Motion(durations, drawn, missed)
+        self._fade(motion)
+        return motion
+
+    def _fade(self, motion: Motion) -> None:
+        """Change the charts of a motion over :data:`FADE_S` after feet leave and before they land,
+        so that no leg jumps from the clip's posture to that which has its foot in place.
+        """
+        rows = [(k, i) for k, charts in enumerate(motion.charts) for i in range(len(charts))]
+        ends = pairwise(motion.starts)
+        sizes = map(len, motion.charts)
+        t = np.concatenate([np.linspace(*x, n) for x, n in zip(ends, sizes, strict=True)])
+        moved = np.concatenate([q - self.sampled(k, len(q)) for k, q in enumerate(motion.charts)])
+        for side, columns in enumerate(self.body.legs):
+            in_air = [side not in modes_of(self.phases[k][0]) for k, _ in rows]
+            for first, end in spans(in_air):
+                for event in {first - 1, end} - {-1, len(rows)}:
+                    for row in range(first, end):
+                        k, i = rows[row]
+                        left = max(0.0, 1 - abs(t[row] - t[event]) / FADE_S)
+                        share = left**2 * (3 - 2 * left)
+                        motion.charts[k][i, columns] += share * moved[event, columns]
 
     def sampled(self, k: int, count: int) -> np.ndarray:
         """Charts (``count``, 6 + joints) of the clip, evenly over phase ``k``."""
@@ -580,14 +600,3 @@ def _changes(before: ClipReport, draft: Draft, plan: JumpPlan) -> list[dict[str,
             row = {"what": what.format(i), "clip": clip, "mended": float(mended)}
             rows.append(row | {"change": row["mended"] - clip})
     return rows
-
-
-def _binding(plan: JumpPlan) -> tuple[str, ...]:
-    """Limits that bind, by what they are worth: the sum of their multipliers."""
-    worth: Counter[str] = Counter()
-    solution = plan.whole_body.solution
-    kinds = {(r["phase"], r["name"]): r["kind"] for r in solution.constraint_report}
-    for (owner, name), (_, values) in solution.multipliers.rows.items():
-        if kinds.get((owner, name)) == "inequality":
-            worth[name] += float(np.abs(values).sum())
-    return tuple(name for name, x in worth.most_common(5) if x > NEAR)

@@ -31,8 +31,15 @@ EVERY = 4  # of so many samples one is looked at for it
 def used_between(
     tape: Tape, robot: Robot, surface: Surface = Surface(), body: Body | None = None
 ) -> float:
-    """Largest share [1] that the tape uses of the limits of motors, stops, ground, and of gaps
-    between angles, rates and accelerations.
+    """Largest share [1] that the tape uses of a limit, see :func:`shares_between`."""
+    return max(shares_between(tape, robot, surface, body).values())
+
+
+def shares_between(
+    tape: Tape, robot: Robot, surface: Surface = Surface(), body: Body | None = None
+) -> dict[str, float]:
+    """Largest shares [1] that the tape uses of the limits of motors, stops, ground, and of gaps
+    between angles, rates and accelerations, by their names.
 
     The limits are those of the audit; up to 1 the tape holds them, also between the nodes. Soles
     that in the middle of a flight are as low as they may be use all of their height, on the surface
@@ -45,18 +52,19 @@ def used_between(
     least, most = motors.range(rates)
     origin, turn = feet_of(robot, tape.q)
     along = np.linalg.norm(tape.f[..., :2], axis=-1)
-    shares = [
-        1 + np.maximum(tape.tau - most, least - tape.tau) / motors.effort,
-        np.abs(rates) / motors.speed,
-        np.maximum(motors.lower - angles, angles - motors.upper) / RANGE_GAP,
-        along / (FRICTION * np.maximum(tape.f[..., 2], of(LOADED_N, "N"))),
-        _pressed_outside(tape, robot, turn) / PRESSURE_GAP,
-        _gap(tape.t, angles, rates) / of(RATE_GAP, "rad/s"),
-        _gap(tape.t, rates, tape.a[:, 6:]) / of(ACCELERATION_GAP, "rad/s^2"),
-        _low(tape, robot, surface, origin, turn),
-        *([] if body is None or not surface.height_m else [_at_edge(tape, body, surface)]),
-    ]
-    return float(max(x.max() for x in shares))
+    shares = {
+        "torque": 1 + np.maximum(tape.tau - most, least - tape.tau) / motors.effort,
+        "joint speed": np.abs(rates) / motors.speed,
+        "joint range": np.maximum(motors.lower - angles, angles - motors.upper) / RANGE_GAP,
+        "friction": along / (FRICTION * np.maximum(tape.f[..., 2], of(LOADED_N, "N"))),
+        "CoP in the sole": _pressed_outside(tape, robot, turn) / PRESSURE_GAP,
+        "rates": _gap(tape.t, angles, rates) / of(RATE_GAP, "rad/s"),
+        "accelerations": _gap(tape.t, rates, tape.a[:, 6:]) / of(ACCELERATION_GAP, "rad/s^2"),
+        "height of the soles": _low(tape, robot, surface, origin, turn),
+    }
+    if body is not None and surface.height_m:
+        shares["shanks at the edge"] = _at_edge(tape, body, surface)
+    return {name: float(x.max()) for name, x in shares.items()}
 
 
 def _gap(t: np.ndarray, values: np.ndarray, rates: np.ndarray) -> np.ndarray:

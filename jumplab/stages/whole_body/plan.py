@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -18,6 +19,8 @@ from jumplab.stages.whole_body.settings import Limits
 from jumplab.stages.whole_body.starts import Attempt
 from jumplab.stages.whole_body.tape import make_tape
 from jumplab.task import JumpTask
+
+NEAR = 1e-3  # of a limit's size: it binds
 
 
 @dataclass(frozen=True, repr=False)
@@ -69,6 +72,16 @@ class WholeBodyPlan(Shown):
             ),
             start,
         )
+
+    @property
+    def binding(self) -> tuple[str, ...]:
+        """Limits that bind, by what they are worth: the sum of their multipliers."""
+        worth: Counter[str] = Counter()
+        kinds = {(r["phase"], r["name"]): r["kind"] for r in self.solution.constraint_report}
+        for (owner, name), (_, values) in self.solution.multipliers.rows.items():
+            if kinds.get((owner, name)) == "inequality":
+                worth[name] += float(np.abs(values).sum())
+        return tuple(name for name, x in worth.most_common(5) if x > NEAR)
 
     @property
     def manner(self) -> dict[str, float]:

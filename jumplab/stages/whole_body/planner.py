@@ -20,6 +20,7 @@ from jumplab.robot import Robot
 from jumplab.robot.stance import holding
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
+from jumplab.stages.whole_body.between import shares_between
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import Contacts, jump_contacts
 from jumplab.stages.whole_body.coordinates import Coordinates, even, in_plane, whole
@@ -210,10 +211,15 @@ class WholeBodyPlanner:
             if left_s() <= 0:
                 raise _farthest(failures)
             raise (explain and self._explained(programs[-1], asked)) or failures[-1]
+        shares = shares_between(best.tape, self.robot, programs[-1].surface(task), self.body)
+        shares["distance of links"] = best.used  # the largest where links meet
+        name = max(shares, key=shares.get)
         raise SolverError(
-            f"{NAME}: motions that keep every limit at the nodes break them between the nodes, at "
-            f"best by a factor of {best.used:.3g}; ask for less, or for a finer mesh",
+            f"{NAME}: motions that keep every limit at the nodes break that of {name} between "
+            f"them, at best by a factor of {best.used:.3g}, pressed by {', '.join(best.binding)}; "
+            f"ask for less, or for a finer mesh",
             stage=NAME,
+            violations=best.binding,
         )
 
     @in_turn
