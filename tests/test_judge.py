@@ -111,6 +111,34 @@ def test_motors_that_are_too_weak_for_a_plan_are_found_at_usual_rates_and_no_oth
     assert {c.name for c in judged(0.4).failed} == {"joint torque", "torque at speed"}
 
 
+@pytest.mark.parametrize("fps", [30, 100])
+def test_what_stands_on_a_platform_is_judged_if_its_height_is_told(fps):
+    plan = jl.plan(jl.JumpTask(0.4, 0.3, platform_m=0.2))
+    run = jl.simulate(plan)
+    assert jl.judge(plan, fps=fps).passed and jl.judge(run, fps=fps, platform_m=0.2).passed
+    assert "standing feet float" in {c.name for c in jl.judge(run, fps=fps).failed}
+
+
+def test_a_turn_on_the_spot_has_a_flight():
+    """At its apex feet are as slow as those that stand."""
+    plan = jl.plan(jl.JumpTask(0.0, 0.2, yaw_rad=1.57))
+    report = jl.judge(plan, fps=100)
+    (begin, end) = report.flights[0]
+    assert report.passed and end - begin == pytest.approx(plan.tape.t[-1] - plan.tape.takeoff_time, abs=0.15)
+
+
+@NO_ROBOTS
+@pytest.mark.parametrize("fps", [30, 100])
+def test_a_joint_leans_on_its_stop_which_takes_what_the_motor_cannot(fps):
+    """As the waist of a G1 does when it has landed, with its motor spent."""
+    run = jl.simulate(jl.plan(jl.JumpTask(0.3, 0.2), "g1"))
+    waist = run.joint_names.index("waist_pitch_joint")
+    spent = np.abs(run.tau[:, waist]) > 0.99 * run.robot.limits.effort[waist]
+    assert run.landed and spent.mean() > 0.03
+    report = jl.judge(run, fps=fps)
+    assert report.passed, report.table()
+
+
 def test_a_foot_that_swings_low_over_the_ground_does_not_slide():
     report = jl.judge(jl.plan(jl.JumpTask(-0.3, 0.2)), fps=1000)
     assert report["feet on the ground slide"].passed, report.table()

@@ -37,6 +37,8 @@ LASTING = {
     )
     for name in ("joint torque", "torque at speed")
 }
+# stops of engines and robots give way
+YIELDING = {"joint range": dataclasses.replace(LIMITS["joint range"], limit=METHOD.stop_mrad)}
 
 
 @dataclass(frozen=True, repr=False)
@@ -95,6 +97,7 @@ def judge(
     *,
     fps: float | None = None,
     order: str = "depth-first",
+    platform_m: float | None = None,
 ) -> ClipReport | list[ClipReport]:
     """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
     fall, unphysical forces, motors, joints, collisions.
@@ -112,12 +115,14 @@ def judge(
         joints is taken.
     fps : frame rate of files that do not say [1/s].
     order : of joints without names, "depth-first" or "breadth-first".
+    platform_m : height of a platform on which feet may stand as well [m]; that of a plan is known.
     """
+    known = {} if platform_m is None else {"platform_m": platform_m}
     if isinstance(motion, Clip):
-        return _judged(motion)
+        return _judged(dataclasses.replace(motion, **known))
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
     if not isinstance(motion, str | Path):
-        return _judged(Clip.of(motion, robot, fps))
+        return _judged(dataclasses.replace(Clip.of(motion, robot, fps), **known))
     path = as_path(motion, "a clip")
     paths = [path]
     if path.is_dir():
@@ -127,14 +132,18 @@ def judge(
                 f"{path}: holds no file that ends in {', '.join(ENDINGS)}; give a folder of clips"
             )
     clips = [clip for one in paths for clip in read_clips(one, robot, fps=fps, order=order)]
-    reports = [_judged(clip) for clip in clips]
+    reports = [_judged(dataclasses.replace(clip, **known)) for clip in clips]
     return reports if path.is_dir() or len(reports) > 1 else reports[0]
 
 
 def _judged(clip: Clip) -> ClipReport:
     bare = tape_of(clip)
     r = replay(bare, clip.robot, None)
-    ground, still, level = contacts(r, clip.fps)
+    z = r.sole_points[..., 2].min(axis=2)
+    low, high = sorted((0.0, clip.platform_m))
+    height = z - np.where(z > high - METHOD.step_m, high, low)
+    ground, still, level = contacts(r, clip.fps, height)
+    depth = np.where(ground, -height, low - z)  # in the air beside a platform none is in it
     tape = dataclasses.replace(
         bare,
         f=_pushed(r, ground),
@@ -142,15 +151,15 @@ def _judged(clip: Clip) -> ClipReport:
         extra={"contacts": ground.astype(np.int8)},
     )
     r = replay(tape, clip.robot, None)
-    tape = dataclasses.replace(tape, tau=r.tau)
+    tape = dataclasses.replace(tape, tau=_of_motors(r))
     r = dataclasses.replace(r, tape=tape)
     falls = _free_falls(r, ground)
     measures = [
-        *_measures(r, ground, level, falls),
+        *_measures(r, ground, (height, depth, level), falls),
         *map(_lasting(clip.fps), joints(r)),
         *collisions(r),
     ]
-    checks = _checks(measures, LIMITS | LASTING)
+    checks = _checks(measures, LIMITS | LASTING | YIELDING)
     checks = tuple(c for c in checks if c.name != "body clearance")
     manifest = {
         "clip": clip.name,
@@ -199,23 +208,28 @@ def tape_of(clip: Clip) -> Tape:
 
 # contacts
 # ----------------------------------------------------------------------------------------------
-def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def contacts(
+    r: Replay, fps: float, height: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whether each foot carries (n, 2), whether it is still (n, 2), and how high it would stand
-    (n, 2) [m].
+    (n, 2) [m]; ``height`` (n, 2) is how high it is.
 
-    A foot stands where its sole is slow, and not far above the lowest one around: so far its height
-    is that of the ground, and linear between. In the air it is while it is
-    ``METHOD.lifted_m`` higher than that, or fast while the other one stands, or faster than any
-    foot slides. Phases shorter than ``METHOD.short_s`` are ignored.
+    A foot stands where its sole is slow, and not far above the lowest one around, nor lifted in
+    free fall: so far its height is that of the ground, and linear between. In the air it is while
+    it is ``METHOD.lifted_m`` higher than that, or fast while the other one stands, or faster than
+    any foot slides. Phases shorter than ``METHOD.short_s`` are ignored.
     """
     from scipy.ndimage import gaussian_filter1d, minimum_filter1d  # slow to import
 
     least = max(1, round(METHOD.short_s * fps))
     middle = gaussian_filter1d(r.sole_points.mean(axis=2), METHOD.smoothing_s * fps, axis=0)
     speed = norm(np.gradient(middle, 1 / fps, axis=0))
-    height = r.sole_points[..., 2].min(axis=2)
     around = minimum_filter1d(height.min(axis=1), round(METHOD.around_s * fps) | 1, mode="nearest")
-    still = (speed < METHOD.still_m_s) & (height - around[:, None] < METHOD.high_m)
+    over = height - around[:, None]
+    # at the apex of a jump on the spot feet are slow as well
+    falls = np.abs(r.com_acceleration[:, 2] / r.gravity + 1) < METHOD.fall_share
+    still = (speed < METHOD.still_m_s) & (over < METHOD.high_m)
+    still &= ~(falls[:, None] & (over > METHOD.near_m))
     for column in still.T:
         _drop(column, False, least + 1)
         _drop(column, True, least + 1)
@@ -227,6 +241,7 @@ def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     gliding = (speed > METHOD.flies_m_s).all(axis=1, keepdims=True)
     low = (height - level < METHOD.lifted_m) & ~gliding
     carrying = still | (low & ~still.any(axis=1, keepdims=True))
+    carrying[falls & (over > METHOD.near_m).all(axis=1)] = False
     flying = ~carrying.any(axis=1)
     kept = flying.copy()
     _drop(kept, True, least)
@@ -277,6 +292,16 @@ def _pushed(r: Replay, ground: np.ndarray) -> np.ndarray:
     return f
 
 
+def _of_motors(r: Replay) -> np.ndarray:
+    """Torques (n, joints) of the motors [N m]: a joint at its stop leans on it, and the stop takes
+    what pushes the joint further.
+    """
+    angles = r.tape.q[:, 7:]
+    above = angles > r.model.upperPositionLimit[7:] - METHOD.stop_mrad / 1e3
+    below = angles < r.model.lowerPositionLimit[7:] + METHOD.stop_mrad / 1e3
+    return np.where(above, np.maximum(r.tau, 0.0), np.where(below, np.minimum(r.tau, 0.0), r.tau))
+
+
 def _pushes(r: Replay, k: int, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pushes along the edges of the friction cones at the corners of the soles ``sides`` in sample
     ``k``: wrenches (6, m) at the feet, the same about the CoM as shares of the weight (6, m), and
@@ -303,16 +328,18 @@ def _pushes(r: Replay, k: int, sides: np.ndarray) -> tuple[np.ndarray, np.ndarra
 # measures
 # ----------------------------------------------------------------------------------------------
 def _measures(
-    r: Replay, ground: np.ndarray, level: np.ndarray, falls: list[Fall]
+    r: Replay, ground: np.ndarray, places: tuple[np.ndarray, ...], falls: list[Fall]
 ) -> Iterator[Measure]:
-    """Measures of the group "clip"; ``level`` (n, 2) is how high each foot would stand [m]."""
+    """Measures of the group "clip"; ``places`` (n, 2) say how high each foot is over its ground,
+    how deep in it, and how high it would stand [m].
+    """
+    height, depth, level = places
     t = r.tape.t
     feet = r.tape.contact_frames
-    height = r.sole_points[..., 2].min(axis=2)
     standing = _inner(ground, t)
     floating = np.where(standing, height, -np.inf)
     yield "standing feet float", *_most(floating, t, METHOD.float_percent), feet
-    yield "feet in the ground", -height, t, feet
+    yield "feet in the ground", depth, t, feet
     near = standing & (height - level < METHOD.near_m)
     yield "feet on the ground slide", *_most(_sliding(r, near), t, METHOD.slide_percent), feet
     off = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]

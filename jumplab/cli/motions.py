@@ -24,7 +24,8 @@ NEAR = 0.12
 
 def judge(args: Namespace) -> None:
     """Judge motion clips: find motions that no robot could do."""
-    found = jl.judge(args.file, args.robot, fps=args.fps, order=args.order)
+    given = {"fps": args.fps, "order": args.order, "platform_m": args.platform_m}
+    found = jl.judge(args.file, args.robot, **given)
     reports = found if isinstance(found, list) else [found]
     passed = sum(report.passed for report in reports)
     rows = [report.row() for report in reports]

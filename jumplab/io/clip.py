@@ -61,6 +61,7 @@ class Clip(Shown):
     q : (n, nq) x y z qx qy qz qw of the base in the world, then joint angles [m, rad].
     fps : frames a second [1/s].
     origin : format of the file, in words; ``notes`` say what was taken for granted.
+    platform_m : height of a platform beside the ground [m].
     """
 
     name: str
@@ -69,6 +70,7 @@ class Clip(Shown):
     fps: float
     origin: str
     notes: tuple[str, ...] = ()
+    platform_m: float = 0.0
 
     def line(self) -> str:
         """Name, robot, frames, rate, format, and what was taken for granted."""
@@ -87,7 +89,9 @@ class Clip(Shown):
         if robot is None:
             raise InputError("the robot of this motion is unknown; pass it as robot=")
         motion = Motion.of(getattr(record, "tape", record)).every(fps or RECORD_FPS)
-        return cls(motion.source, robot, motion.q, fps or RECORD_FPS, "a motion of this package")
+        clip = cls(motion.source, robot, motion.q, fps or RECORD_FPS, "a motion of this package")
+        task = getattr(record, "task", None)
+        return replace(clip, platform_m=task.platform_m) if task else clip
 
 
 @dataclass(frozen=True)
