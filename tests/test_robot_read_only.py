@@ -50,7 +50,7 @@ def test_whatever_is_exposed_refuses_to_be_written_to(way):
                     setattr(x, name, 0.0)
         else:
             assert isinstance(x, str | int | float | tuple), path
-    assert kinds == {*"Robot SagittalModel MotorLimits Foot ndarray mappingproxy tuple str int float bool".split()}
+    assert kinds == {*"Robot SagittalModel MotorLimits Bus Foot ndarray mappingproxy tuple str int float bool".split()}
     assert alike(robot, way(Robot.load()))
 
 

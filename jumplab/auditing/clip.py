@@ -351,8 +351,8 @@ def _measures(
 
 
 def _lasting(fps: float) -> Callable[[Measure], Measure]:
-    """What makes torque shares (n, joints) of a measure the least over METHOD.lasting_s around, of
-    others nothing.
+    """A function that makes torque shares (n, joints) of a measure the least over METHOD.lasting_s
+    around, and leaves other measures alone.
     """
     from scipy.ndimage import minimum_filter1d  # slow to import
 

@@ -29,8 +29,10 @@ def waiting(out: TextIO, head: str = "", first: str = "") -> Iterator[None]:
     """
     form = "{desc}, {elapsed_s:.0f} s"
     timing = dict(delay=0.0 if first else FIRST_S, mininterval=REDRAW_S, miniters=0)
+    shape = dict(bar_format=form, leave=False, ncols=WIDTH, nrows=20)
+    begin = head + first if first else None
     count = ""
-    with tqdm(bar_format=form, leave=False, ncols=WIDTH, nrows=20, file=out, **timing) as bar:
+    with tqdm(desc=begin, file=out, **shape, **timing) as bar:
 
         def hear(what: str, done: int, of: int) -> None:
             nonlocal count
@@ -40,8 +42,6 @@ def waiting(out: TextIO, head: str = "", first: str = "") -> Iterator[None]:
             bar.set_description_str(head + ", ".join(words), refresh=False)
             bar.update(0)
 
-        if first:
-            hear(first, 0, 0)
         ended = threading.Event()
 
         def keep() -> None:
