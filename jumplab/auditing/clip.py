@@ -37,8 +37,9 @@ LASTING = {
     )
     for name in ("joint torque", "torque at speed")
 }
-# stops of engines and robots give way
-YIELDING = {"joint range": dataclasses.replace(LIMITS["joint range"], limit=METHOD.stop_mrad)}
+# of clips: stops of engines and robots give way
+ALLOWED = LIMITS | LASTING
+ALLOWED["joint range"] = dataclasses.replace(LIMITS["joint range"], limit=METHOD.stop_mrad)
 
 
 @dataclass(frozen=True, repr=False)
@@ -159,7 +160,7 @@ def _judged(clip: Clip) -> ClipReport:
         *map(_lasting(clip.fps), joints(r)),
         *collisions(r),
     ]
-    checks = _checks(measures, LIMITS | LASTING | YIELDING)
+    checks = _checks(measures, ALLOWED)
     checks = tuple(c for c in checks if c.name != "body clearance")
     manifest = {
         "clip": clip.name,

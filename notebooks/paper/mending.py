@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jumplab as jl
-from jumplab.auditing.clip import LASTING, ClipReport
-from jumplab.auditing.report import LIMITS
+from jumplab.auditing.clip import ALLOWED, ClipReport
 from jumplab.errors import JumplabError
 from jumplab.io.clip import ENDINGS
 from jumplab.sim import ENGINES
@@ -65,7 +64,7 @@ def _played(mended: Mended) -> dict[str, bool | None]:
 
 def failing(measures: Mapping[str, float]) -> list[str]:
     """Names of the measures that are beyond what judging allows."""
-    limits = {name: (LIMITS | LASTING)[name.rpartition(" [")[0]] for name in measures}
+    limits = {name: ALLOWED[name.rpartition(" [")[0]] for name in measures}
     signs = {name: -1 if limit.at_least else 1 for name, limit in limits.items()}
     return [name for name, x in measures.items() if signs[name] * (x - limits[name].limit) > 0]
 
