@@ -117,8 +117,8 @@ def test_every_length_time_and_weight_is_of_a_size():
         "edge_clearance_m", "edge_smoothing_m", "edge_before_heel_m", "edge_step_m", "flight_s"}  # fmt: skip
     assert set(vars(Weights())) - set(WEIGHT_UNITS) == {"follow_duration"}
     assert size(ROBOT) == Size(1.0, 1.0) and Limits().of_size(size(ROBOT)) == Limits()
-    of_child = Limits().of_size(Size(0.3, 0.04))  # the audit's least distance of links is one for all
-    assert of_child.link_distance_m == Limits().link_distance_m and of_child.clearance_m < Limits().clearance_m
+    of_child = Limits().of_size(Size(0.3, 0.04))  # the audit's least distance of links, 1 mm, is one for all
+    assert of_child.link_distance_m == 0.002 and of_child.clearance_m < Limits().clearance_m
 
 
 @pytest.mark.slow

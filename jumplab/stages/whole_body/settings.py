@@ -109,10 +109,10 @@ class Limits:
     def of_size(self, size: Size) -> Limits:
         """Those of a robot of another ``size``, whose jumps they make alike; edges of platforms
         are the world's, and how long a flight may last depends on gravity. Links of small robots
-        keep the same distance, since the audit's is of meshes, which are as fine for all.
+        keep :data:`LINKS_LEAST_M` apart.
         """
         scaled = size.scaled(self, LIMIT_UNITS)
-        kept = max(scaled.link_distance_m, self.link_distance_m)
+        kept = max(scaled.link_distance_m, LINKS_LEAST_M)
         return replace(scaled, link_distance_m=kept)
 
     def of_flip(self) -> Limits:
@@ -196,6 +196,8 @@ class Weights:
         )
 
 
+# the audit's 1 mm, and 1 mm by which links may be nearer than their row before it is met
+LINKS_LEAST_M = 0.002
 # of the numbers that grow with the robot
 LIMIT_UNITS = dict.fromkeys(
     (
