@@ -159,6 +159,20 @@ def bounds(folder: str | Path, n: int = 10, path: Path = BOUNDS) -> None:
             log.add(row | worked | {"stand": series["stood"], "of": n})
 
 
+def bounds_table(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line per way of planning five bounds."""
+    return [
+        {
+            "five bounds": row["how"],
+            "CPU [s]": sum(row["cpu_s"]),
+            "until the last touchdown [s]": row["time_s"],
+            "work of the motors [J]": row["work_j"],
+            "perturbed": f"{row['stand']} of {row['of']}",
+        }
+        for row in rows
+    ]
+
+
 def _worked(runs: list[sim.SimulationResult]) -> dict[str, float]:
     """Time [s] and work of the motors [J], braking not counted, from the start to the last touchdown."""
     *before, last = runs
