@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -58,6 +59,10 @@ class WholeBodyPlan(Shown):
         surface = program.surface(task)
         phases = solved.phases
         tape = make_tape(solved.schedule.whole, phases, task.gravity)
+        used = max(
+            used_between(tape, robot, surface, program.body),
+            used_apart(program.body, solved.schedule.apart, list(phases.values()), tape),
+        )
         return cls(
             task,
             solved.solution,
@@ -66,10 +71,7 @@ class WholeBodyPlan(Shown):
             surface.edge_m - robot.foot.toe + float(robot.foot.center[0]),
             program.limits,
             tape,
-            max(
-                used_between(tape, robot, surface, program.body),
-                used_apart(program.body, solved.schedule.apart, list(phases.values()), tape),
-            ),
+            used if math.isfinite(used) else math.inf,  # a tape that diverges is the worst
             start,
         )
 
