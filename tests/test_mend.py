@@ -18,10 +18,12 @@ from jumplab.io import export
 from jumplab.io.motion import Motion
 from jumplab.ocp.nlp import RESIDUAL_LIMIT
 from jumplab.robot import Robot
+from jumplab.stages.plan import JumpPlan
 from jumplab.stages.whole_body import Limits, Weights
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.terms import smoothness
+from jumplab.studies import mend as study
 from jumplab.studies.mend import AROUND_S, TOES_S, Draft, planned_phases
 
 
@@ -160,6 +162,16 @@ def test_feet_that_carry_little_after_a_landing_need_no_finer_mesh():
     plan = jl.mend(CLIPS / "jump_degree_level4.pkl", "g1").plan
     assert "finer mesh" not in [x.start for x in plan.whole_body.attempts]
     assert plan.whole_body.used < 1 and jl.audit(plan).passed
+
+
+@NO_ROBOTS
+@pytest.mark.slow
+def test_a_nearest_motion_that_fails_its_audit_is_none(monkeypatch):
+    monkeypatch.setattr(study, "FACTORS", (0.8,))
+    monkeypatch.setattr(JumpPlan, "audit", SimpleNamespace(failed=[SimpleNamespace(name="base residual")]))
+    sentence = r"the nearest motion fails its audit \(base residual\), pressed by .+; nor can it with 0\.8 of"
+    with pytest.raises(InfeasibleError, match=sentence):
+        jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
 
 
 @NO_ROBOTS

@@ -213,6 +213,10 @@ def _judged(motion: Any, robot: Robot | str, fps: float | None, order: str) -> C
 def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended:
     draft = Draft(before, factor)
     plan = planner.follow(draft.contacts, motion=draft.motion, stance=draft.start)
+    if failed := plan.audit.failed:
+        names = ", ".join(check.name for check in failed)
+        pressed = ", ".join(plan.whole_body.binding)
+        raise SolverError(f"the nearest motion fails its audit ({names}), pressed by {pressed}")
     rows = tuple(_changes(before, draft, plan))
     return Mended(plan, before, rows, plan.whole_body.binding, factor, draft.span_s)
 
