@@ -58,11 +58,12 @@ class WholeBodyPlan(Shown):
         task = program.found(task, solved)
         surface = program.surface(task)
         phases = solved.phases
-        tape = make_tape(solved.schedule.whole, phases, task.gravity)
-        used = max(
-            used_between(tape, robot, surface, program.body),
-            used_apart(program.body, solved.schedule.apart, list(phases.values()), tape),
-        )
+        with np.errstate(all="ignore"):  # a tape may diverge
+            tape = make_tape(solved.schedule.whole, phases, task.gravity)
+            used = max(
+                used_between(tape, robot, surface, program.body),
+                used_apart(program.body, solved.schedule.apart, list(phases.values()), tape),
+            )
         return cls(
             task,
             solved.solution,
@@ -71,7 +72,7 @@ class WholeBodyPlan(Shown):
             surface.edge_m - robot.foot.toe + float(robot.foot.center[0]),
             program.limits,
             tape,
-            used if math.isfinite(used) else math.inf,  # a tape that diverges is the worst
+            used if math.isfinite(used) else math.inf,
             start,
         )
 
