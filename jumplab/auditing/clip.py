@@ -39,7 +39,7 @@ LASTING = {
 }
 # of clips: stops of engines and robots give way
 ALLOWED = LIMITS | LASTING
-ALLOWED["joint range"] = dataclasses.replace(LIMITS["joint range"], limit=METHOD.stop_mrad)
+ALLOWED["joint range"] = dataclasses.replace(LIMITS["joint range"], limit=METHOD.give_mrad)
 
 
 @dataclass(frozen=True, repr=False)

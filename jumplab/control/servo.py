@@ -85,8 +85,6 @@ class Drive:
         """Torque (n,) [N m] at encoder readings ``angles`` (n,) [rad] and ``rates`` (n,)
         [rad/s].
         """
-        if self.kp is self.kd:  # nothing to hold
-            return self.tau
         return self.tau + self.kp * (self.q - angles) + self.kd * (self.rate - rates)
 
 

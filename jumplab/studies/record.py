@@ -271,13 +271,14 @@ class _Search:
         return seeking.finer if self.given.standing else seeking
 
     def starts(self, best: list[tuple]) -> Iterator[JumpTask]:
-        """Jumps to begin with: easy ones (:data:`EASY`), then shares of the ``best`` one; after
-        steps, where each takes a minute or more, the middle one of them alone.
+        """Jumps to begin with: easy ones (:data:`EASY`), if none of them led anywhere half and a
+        quarter of the easiest, then shares of the ``best`` one; after steps, where each takes a
+        minute or more, the middle one of the easy ones alone.
         """
         leg = self.stage.body.leg_m
         alone = not self.given.standing
         easy = EASY[self.what][alone : 2 if alone else None]
-        less = [(share * easy[0][0], share * easy[0][1]) for share in HALVES]
+        less = [(x * easy[0][0], x * easy[0][1]) for x in HALVES if not alone]
         for k, (number, rise) in enumerate([*easy, *less]):
             if k >= len(easy) and best:
                 break

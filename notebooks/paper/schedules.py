@@ -18,7 +18,7 @@ from scipy.integrate import trapezoid
 import jumplab as jl
 from jumplab import sim
 from jumplab.control import STEP_S
-from jumplab.errors import SolverError
+from jumplab.errors import JumplabError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, by_phase, new_figure
@@ -129,10 +129,14 @@ def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = RO
             if (robot, name) in log.done:
                 continue
             began = time.process_time()
-            found = jl.record(robot, "distance_m", asked[name], engines=())
-            jl.save(Path(folder) / f"{robot} record {name}", found.plan)
-            row = {"robot": robot, "from": name, "distance_m": found.value, "at_nodes_m": found.best}
-            log.add(row | {"cpu_s": round(time.process_time() - began, 1), "line": found.line()})
+            row: dict[str, Any] = {"robot": robot, "from": name}
+            try:
+                found = jl.record(robot, "distance_m", asked[name], engines=())
+                jl.save(Path(folder) / f"{robot} record {name}", found.plan)
+                row |= {"distance_m": found.value, "at_nodes_m": found.best, "line": found.line()}
+            except JumplabError as e:
+                row |= {"distance_m": None, "line": str(e)}
+            log.add(row | {"cpu_s": round(time.process_time() - began, 1)})
 
 
 def bounds(folder: str | Path, n: int = 10, path: Path = BOUNDS) -> None:

@@ -64,7 +64,7 @@ def shares_between(
     }
     if body is not None and surface.height_m:
         shares["shanks at the edge"] = _at_edge(tape, body, surface)
-    return {name: float(x.max()) for name, x in shares.items()}
+    return {name: float(np.nan_to_num(x.max(), nan=np.inf)) for name, x in shares.items()}
 
 
 def _gap(t: np.ndarray, values: np.ndarray, rates: np.ndarray) -> np.ndarray:

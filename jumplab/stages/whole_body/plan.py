@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -58,7 +57,7 @@ class WholeBodyPlan(Shown):
         task = program.found(task, solved)
         surface = program.surface(task)
         phases = solved.phases
-        with np.errstate(all="ignore"):  # a tape may diverge
+        with np.errstate(all="ignore"):  # a tape may diverge; its share is inf
             tape = make_tape(solved.schedule.whole, phases, task.gravity)
             used = max(
                 used_between(tape, robot, surface, program.body),
@@ -72,7 +71,7 @@ class WholeBodyPlan(Shown):
             surface.edge_m - robot.foot.toe + float(robot.foot.center[0]),
             program.limits,
             tape,
-            used if math.isfinite(used) else math.inf,
+            used,
             start,
         )
 
