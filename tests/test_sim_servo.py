@@ -263,3 +263,10 @@ def test_states_that_are_no_robot_s_are_refused_in_a_sentence(bhr, tape):
     first = str(renamed[0])
     with pytest.raises(InputError, match=rf"^the tape's joints {first}, .* are not those of robot bhr; plan the jump"):
         Controller(replace(tape, joint_names=renamed), bhr)
+
+
+def test_a_drive_whose_two_gains_are_one_array_holds_its_joint():
+    gains = np.array([3.0, 5.0])
+    drive = law.Drive(np.zeros(2), q=np.ones(2), rate=np.zeros(2), kp=gains, kd=gains)
+    np.testing.assert_allclose(drive.torque(np.zeros(2), np.zeros(2)), gains)
+    np.testing.assert_allclose(drive.torque(np.ones(2), np.ones(2)), -gains)

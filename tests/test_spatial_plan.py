@@ -355,6 +355,9 @@ def test_limits_between_the_nodes_are_seen(bhr):
         moved = getattr(tape, name).copy()
         moved[row, column] += 2 * change
         assert used_between(replace(tape, **{name: moved}), bhr) > 1, name
+    diverged = tape.tau.copy()
+    diverged[5] = np.nan
+    assert used_between(replace(tape, tau=diverged), bhr) == np.inf
     (ahead, _, below), down = tape.f[row, 0, [0, 1, 2]], -bhr.foot.tip[2]  # on a flat foot that looks ahead
     assert np.all(tape.extra["contacts"][row] == FLAT)
     for share in (0.99, 1.01):
