@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fixtures_core import import_graph, jump
+from paper import margins
+from paper.margins import margin_chart
 from test_store import make_tape, names
 
 from jumplab.errors import InputError, SolverError
 from jumplab.io import folder as store
-from jumplab.show import margin_chart
 from jumplab.sim import Finding, Perturbation, Ranges, Scene, SensorNoise, Sign, SimulationResult, signs
-from jumplab.studies import margins
 from jumplab.studies import study as studies
 from jumplab.studies import trials as monte_carlo
 from jumplab.studies.trials import PlanOnFile, Trial, TrialKey, TrialSettings, run_trials, wilson

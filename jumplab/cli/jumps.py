@@ -11,7 +11,6 @@ from typing import Any
 
 import jumplab as jl
 from jumplab import io, sim, studies
-from jumplab.cli import notebooks
 from jumplab.cli.common import (
     disturbances,
     given,
@@ -21,6 +20,7 @@ from jumplab.cli.common import (
     print_summary,
     without,
 )
+from jumplab.cli.notebooks import find_notebooks, paper
 from jumplab.errors import InputError
 from jumplab.task import JumpTask
 
@@ -41,9 +41,9 @@ def run(args: Namespace) -> None:
             values[name] = ast.literal_eval(text)
         except (ValueError, SyntaxError, MemoryError, RecursionError):
             values[name] = text
-    options = given(notebooks.run_notebooks, args, progress="quiet" not in args)
-    chosen = notebooks.find_notebooks(args.notebook)
-    report = notebooks.run_notebooks(values, notebooks=chosen, **options)
+    run_notebooks = paper("running").run_notebooks
+    options = given(run_notebooks, args, progress="quiet" not in args)
+    report = run_notebooks(values, notebooks=find_notebooks(args.notebook), **options)
     args.found |= vars(report)
     if (report.out / "plan.npz").is_file():
         args.found["plan"] = io.folder.read_plan(report.out)[2]

@@ -67,9 +67,10 @@ def _settings(args: Namespace, **more: Any) -> Any:
 
 def margins(args: Namespace) -> None:
     """Find the largest size of each disturbance that a plan tolerates."""
-    names = args.disturb or (*studies.margins.SINGLE, *studies.margins.PAIRS)
+    search = paper("margins")
+    names = args.disturb or (*search.SINGLE, *search.PAIRS)
     options = {"folder": args.dir, "seed": args.seed or 0, "settings": _settings(args)}
-    report = resumed(studies.margins.margins, args, names=names, **options)
+    report = resumed(search.margins, args, names=names, **options)
     args.found |= report.to_json()
     print(jl.plots.table([margin.row() for margin in report.margins], digits=3))
     print(f"{report.line()}; margins.json in {args.dir}")

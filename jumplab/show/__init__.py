@@ -25,7 +25,7 @@ _NAMES = {  # module: its public names, loaded when they are first used
     # for plans, for simulations, and the map of what a robot can do
     "jumps": """joint_trajectories inertia_and_momentum margins active ground_reaction jump_strobe
         momentum""",
-    "maps": "envelope_map margin_chart",
+    "maps": "envelope_map",
     # the jump in 3-D, the page of a certificate, tables
     "viewer": "Page page",
     "movies": "Movie movie",

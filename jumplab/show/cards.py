@@ -21,7 +21,7 @@ from jumplab.show.jumps import (
     jump_strobe,
     margins,
 )
-from jumplab.show.maps import envelope_map, margin_chart
+from jumplab.show.maps import envelope_map
 from jumplab.show.style import (
     COLUMN_IN,
     FLIGHT,
@@ -46,7 +46,6 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.stages import Planner
     from jumplab.studies.envelope import Envelope
     from jumplab.studies.improve import Improved
-    from jumplab.studies.margins import MarginReport
     from jumplab.studies.mend import Mended
     from jumplab.studies.prices import Prices
     from jumplab.studies.record import Record
@@ -233,10 +232,6 @@ def _scatter(report: TrialReport) -> Figure | None:
     return fig
 
 
-def _of_margins(report: MarginReport) -> Card:
-    return table([margin.row() for margin in report.margins], digits=3), margin_chart(report)
-
-
 def _of_envelope(envelope: Envelope) -> Card:
     rows = []
     for word in ("highest", "farthest"):
@@ -271,7 +266,7 @@ def _of_rows(rows: Rows) -> Card:
     return table([x if isinstance(x, Mapping) else vars(x) for x in rows]), None
 
 
-CARDS: Mapping[str, Callable[[Any], Card]] = {
+CARDS: dict[str, Callable[[Any], Card]] = {
     "Envelope": _of_envelope,
     "Metrics": _of_metrics,
     "JumpTask": _of_task,
@@ -287,7 +282,6 @@ CARDS: Mapping[str, Callable[[Any], Card]] = {
     "Prices": _of_prices,
     "Improved": _of_improved,
     "TrialReport": _of_trials,
-    "MarginReport": _of_margins,
 }
 
 
