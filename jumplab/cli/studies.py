@@ -113,20 +113,18 @@ def certify(args: Namespace) -> None:
 
 def clips(args: Namespace) -> None:
     """Make a library of clips: a hundred jumps to all sides, audited and landed in both engines."""
-
-    def page(index: Any) -> str:
-        return jl.plots.clips_page(index).html
-
-    draw = jl.plots.draw_film if args.films else jl.plots.draw_strip
+    library = paper("library")
+    draw = library.draw_film if args.films else library.draw_strip
     vary = choices_of("--vary must be WHAT", args.vary) if args.vary else []
-    options = {"format_name": args.format, "vary": vary, "draw": draw, "page": page, "say": print}
-    library = resumed(studies.clips.make_clips, args, "clips", **options)
-    args.found |= {"out": args.out} | library
-    passed = len(library["clips"])
-    count = passed + len(library["left_out"])
+    options = {"format_name": args.format, "vary": vary, "draw": draw, "say": print}
+    make_clips = paper("clips").make_clips
+    found = resumed(make_clips, args, "clips", page=library.clips_page, **options)
+    args.found |= {"out": args.out} | found
+    passed = len(found["clips"])
+    count = passed + len(found["left_out"])
     print(f"{passed} of {count} clips passed; index.json and index.html in {args.out}")
     if not passed:
-        reason = library["left_out"][0]["reasons"][0]
+        reason = found["left_out"][0]["reasons"][0]
         raise InfeasibleError(f"no clip of {args.robot.name} passed: {reason}")
 
 

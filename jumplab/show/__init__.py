@@ -30,7 +30,6 @@ _NAMES = {  # module: its public names, loaded when they are first used
     "viewer": "Page page",
     "movies": "Movie movie",
     "certificate": "certificate_page",
-    "library": "clips_page draw_film draw_strip",
     "tables": "Table table versions",
     "cards": "card clip_sheet price_bars Plots",
     # helpers: bodies, with the sheet of a robot; curves, colours and saving

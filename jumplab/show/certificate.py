@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from jumplab.show.style import LANDING, VERMILION, describe_task
 from jumplab.show.tables import table
 from jumplab.show.viewer import Page, filled
@@ -13,7 +15,7 @@ def certificate_page(certificate: Certificate) -> Page:
     title = f"Certificate: {describe_task(certificate.task)}"
     modes = certificate.modes
     return filled(
-        "certificate.html",
+        Path(__file__).with_suffix(".html"),
         title,
         certificate=certificate,
         conditions=CONDITIONS,

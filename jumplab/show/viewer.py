@@ -64,9 +64,9 @@ class Page:
         )
 
 
-def filled(form: str, title: str, **facts: Any) -> Page:
+def filled(form: Path, title: str, **facts: Any) -> Page:
     """The page that a template of Jinja (the file ``form``) makes of ``facts``."""
-    text = (resources.files("jumplab.show") / form).read_text(encoding="utf-8")
+    text = form.read_text(encoding="utf-8")
     html_ = jinja2.Template(text, autoescape=True).render(
         title=title, made_with=made_with(), **facts
     )

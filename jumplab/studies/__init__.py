@@ -14,7 +14,6 @@ __getattr__, __dir__, __all__ = lazy.attach(
         "atlas",
         "certify",
         "chain",
-        "clips",
         "envelope",
         "grid",
         "record",

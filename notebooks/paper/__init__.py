@@ -1,1 +1,1 @@
-"""Code of the notebooks and of commands that are no part of planning: their runner, forms as printed, claims, studies, figures."""
+"""Code of the notebooks and of commands that plan nothing: their runner, forms as printed, claims, studies, figures."""

@@ -54,7 +54,7 @@ def clips_page(index: Mapping[str, Any]) -> Page:
     done = [*index["clips"], *index["left_out"]]
     title = f"{len(index['clips'])} clips of {index['robot']['name']}"
     return filled(
-        "library.html",
+        Path(__file__).with_suffix(".html"),
         title,
         index=index,
         kinds=dict.fromkeys(row["kind"] for row in done),
