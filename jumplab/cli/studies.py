@@ -78,16 +78,13 @@ def margins(args: Namespace) -> None:
 
 def certify(args: Namespace) -> None:
     """Certify a plan: audit, then both physics engines in some modes, with both contacts."""
-
-    def page(certificate: Any) -> str:
-        return jl.plots.certificate_page(certificate).html
-
-    options = {"folder": args.dir, "seed": args.seed or 0, "page": page}
-    certificate = resumed(studies.certify.certify, args, **options)
+    engines = paper("certify")
+    options = {"folder": args.dir, "seed": args.seed or 0}
+    certificate = resumed(engines.certify, args, **options)
     args.found |= certificate.to_json()
     for mode in certificate.modes:
         print(f"{mode.mode} mode: the engines {'agree' if mode.agree else 'do not agree'}")
-        print(jl.plots.table(mode.differences, studies.certify.COLUMNS, digits=3))
+        print(jl.plots.table(mode.differences, engines.COLUMNS, digits=3))
         landed = ", ".join(f"{count} in {name}" for name, count in mode.landed.items())
         print(
             f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} have the same "

@@ -36,11 +36,11 @@ from jumplab.sim.engine import engine_class
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner, here
 from jumplab.stages.whole_body import Contacts
-from jumplab.studies.certify import ModeReport
 from jumplab.studies.study import Plain, in_parallel, key_of
 from jumplab.studies.sweep import VARIED
 from jumplab.studies.trials import Trial, judged
 from jumplab.task import JumpTask
+from paper.certify import ModeReport
 
 SCHEMA = "jumplab-clips-2"
 INDEX = "index.json"
