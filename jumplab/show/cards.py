@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -36,6 +34,7 @@ from jumplab.show.style import (
     themed,
 )
 from jumplab.show.tables import Table, table
+from jumplab.show.templates import render
 from jumplab.stages.plan import JumpPlan
 
 if TYPE_CHECKING:  # pictures need no simulator
@@ -62,13 +61,9 @@ def card(x: Shown) -> str | None:
     make = next((CARDS[kind.__name__] for kind in type(x).__mro__ if kind.__name__ in CARDS), None)
     if make is None:
         return None
-    rows, figure = make(x)
-    picture = ""
-    if figure is not None:
-        png = base64.b64encode(figure.png()).decode()
-        picture = f'<img src="data:image/png;base64,{png}" style="max-width: 100%">'
-    title = html.escape(f"{type(x).__name__}: {x.line()}")
-    return f"<div><b>{title}</b>{rows._repr_html_()}{picture}</div>"
+    rows, picture = make(x)
+    title = f"{type(x).__name__}: {x.line()}"
+    return render("card.html", title=title, rows=rows, picture=picture)
 
 
 def _listed(values: Mapping[str, Any], heading: str = "value") -> Table:

@@ -6,7 +6,6 @@ display.
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -27,6 +26,7 @@ from jumplab.io.progress import tell
 from jumplab.robot import Robot
 from jumplab.show.shapes import PAINTS, Trace, ground_forces, parts_of, trace
 from jumplab.show.style import INK
+from jumplab.show.templates import render
 from jumplab.sim.checks import ground_of
 from jumplab.sim.scene import Scene
 from jumplab.stages.plan import JumpPlan
@@ -82,11 +82,7 @@ class Movie:
         return write_file(path, self.data)
 
     def _repr_html_(self) -> str:
-        source = f"data:{KINDS[self.kind][0]};base64,{base64.b64encode(self.data).decode()}"
-        look = f'src="{source}" style="max-width: 100%"'
-        if self.kind == "gif":
-            return f'<img {look} alt="the jump">'
-        return f"<video {look} controls loop autoplay muted playsinline></video>"
+        return render("movie.html", kind=self.kind, type=KINDS[self.kind][0], data=self.data)
 
 
 def movie(

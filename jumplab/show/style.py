@@ -7,8 +7,6 @@ closed.
 
 from __future__ import annotations
 
-import base64
-import html
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -30,6 +28,7 @@ from jumplab.arguments import shaped
 from jumplab.errors import InputError, quoted
 from jumplab.io.folder import versions, write_file
 from jumplab.robot import Robot
+from jumplab.show.templates import render
 from jumplab.show.waiting import show_waiting
 from jumplab.task import JumpTask
 
@@ -121,10 +120,7 @@ class Picture(Figure):
     def _repr_html_(self) -> str | None:
         if not self.caption:
             return None
-        words = html.escape(self.caption)
-        source = f"data:image/png;base64,{base64.b64encode(self.png()).decode()}"
-        image = f'<img src="{source}" alt="{words}" style="max-width: 100%">'
-        return f'<figure style="margin: 0">{image}<figcaption>{words}</figcaption></figure>'
+        return render("picture.html", png=self.png(), caption=self.caption)
 
 
 def file_of(fig: Figure, kind: str, **how: Any) -> bytes:
