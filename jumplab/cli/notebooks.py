@@ -1,7 +1,8 @@
 """Places of the notebooks, and of the code beside them that runs and checks them."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from argparse import Namespace
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -40,6 +41,17 @@ def paper(name: str) -> ModuleType:
     if str(_PAPER) not in sys.path:
         sys.path.append(str(_PAPER))
     return import_module(f"paper.{name}")
+
+
+def beside(name: str, words: str) -> Callable[[Namespace], None]:
+    """The command of a ``name`` that ``paper/commands.py`` does, and its help in ``words``."""
+
+    def work(args: Namespace) -> None:
+        getattr(paper("commands"), name)(args)
+
+    work.__name__ = name
+    work.__doc__ = words
+    return work
 
 
 def check_parameters(namespace: Mapping[str, Any]) -> None:
