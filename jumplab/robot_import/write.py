@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
+import jinja2
 import numpy as np
 import pinocchio as pin
 
@@ -84,11 +85,6 @@ def add_boxes(
         add(add(shape, "geometry"), "box", size=size)
 
 
-def filled(template: str, **values: Any) -> str:
-    """A template of this folder with its fields filled in (as :meth:`str.format` does)."""
-    return Path(__file__).with_name(template).read_text(encoding="utf-8").format(**values)
-
-
 def quote(value: Any) -> str:
     """A text or an array of texts, the same in TOML as in JSON."""
     return json.dumps(value, ensure_ascii=False)
@@ -106,11 +102,14 @@ def key(name: str) -> str:
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else quote(name)
 
 
-def rows(values: Mapping[str, float]) -> str:
-    """Lines of a table, name = number."""
-    return "\n".join(f"{quote(name)} = {value:.12g}" for name, value in values.items())
+FORMS = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).parent),
+    trim_blocks=True,
+    keep_trailing_newline=True,
+)
+FORMS.filters |= {"toml": quote, "key": key}
 
 
-def titled(title: str, values: Mapping[str, float]) -> str:
-    """A table below others; nothing if it is empty (name -> number)."""
-    return f"\n\n[{title}]\n{rows(values)}" if values else ""
+def filled(template: str, **values: Any) -> str:
+    """A template of this folder, a TOML file, with its fields filled in by Jinja."""
+    return FORMS.get_template(template).render(values)

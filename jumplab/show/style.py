@@ -287,14 +287,9 @@ def made_with() -> str:
 
 def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -> str:
     """Text of NAME.txt: caption, target (or targets), robot and versions, one line each."""
-    lines = [caption.strip() or "No caption."]
-    tasks = [task] if isinstance(task, JumpTask) else list(task or ())
-    if tasks:
-        words = "; ".join(map(describe_task, tasks))
-        lines.append(f"Target{'s' if len(tasks) > 1 else ''}: {words}.")
-    if robot is not None:
-        lines.append(f"Robot: {robot.name}, {robot.total_mass:.1f} kg, description {robot.hash}.")
-    return "\n".join([*lines, f"Made with {made_with()}.", ""])
+    tasks = [task] if isinstance(task, JumpTask) else task or ()
+    facts = {"robot": robot, "made_with": made_with(), "caption": caption.strip()}
+    return render("caption.txt", tasks=[*map(describe_task, tasks)], **facts)
 
 
 def describe_task(task: JumpTask) -> str:

@@ -1,4 +1,4 @@
-"""HTML by Jinja: what notebooks show of results, and pages."""
+"""Texts by Jinja: what notebooks show of results, pages, captions."""
 
 import base64
 from pathlib import Path
@@ -6,10 +6,13 @@ from typing import Any
 
 import jinja2
 
-FORMS = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
+FORMS = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).parent),
+    autoescape=lambda name: not (name or "").endswith(".txt"),
+)
 FORMS.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
 
 
 def render(form: str, **facts: Any) -> str:
-    """The HTML that a file of this folder makes of ``facts``, escaped where it is not ``safe``."""
+    """The text that a file of this folder makes of ``facts``; in HTML they are escaped."""
     return FORMS.get_template(form).render(facts)
