@@ -19,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.forms import filled
 from jumplab.robot.description import Robot
 from jumplab.robot.files import (
     LEG,
@@ -38,7 +39,6 @@ from jumplab.robot_import.write import (
     add_boxes,
     add_joint,
     add_link,
-    filled,
     shifted,
 )
 
@@ -245,7 +245,7 @@ def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
     ET.indent(robot)
     place = shifted(-trunk.place) * lumped.placed[root]
     return filled(
-        "published.toml.in",
+        "robot_import/published.toml.in",
         trunk=root,
         xyz=0.0 + place.translation,
         rpy=0.0 + pin.rpy.matrixToRpy(place.rotation),
@@ -429,7 +429,7 @@ def _toml(
             values = {joint: x[key] for joint, x in told.items()}
         motors[RATIOS.get(key, key)] = values
     return filled(
-        "jumper.toml.in",
+        "robot_import/jumper.toml.in",
         name=entry(config, "name", kind=str),
         sha256=hashlib.sha256(urdf.encode()).hexdigest(),
         held=lumped.held,

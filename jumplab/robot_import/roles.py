@@ -17,6 +17,7 @@ import numpy as np
 from numpy.linalg import norm
 
 from jumplab.errors import RobotError
+from jumplab.forms import filled
 from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import.checks import (
     MOST_RAD,
@@ -29,7 +30,7 @@ from jumplab.robot_import.checks import (
 )
 from jumplab.robot_import.feet import Sole, find_sole, refuse_wheel, sole_points, thickness
 from jumplab.robot_import.urdf import MOVING, Joint, Tree, read_urdf
-from jumplab.robot_import.write import filled, key, listed
+from jumplab.robot_import.write import key, listed
 
 # None of these numbers is printed by the paper.
 SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
@@ -524,7 +525,8 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     # a short name of letters, digits, - and _
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
     config = filled(
-        "starter.toml.in",
+        "robot_import/starter.toml.in",
+        key=key,
         notes=roles.notes,
         name=name or "robot",
         urdf=path.resolve().as_posix(),

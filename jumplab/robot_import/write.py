@@ -1,19 +1,16 @@
-"""Writers of URDF elements, of numbers with twelve digits, and of TOML files from the templates of
-this folder.
-"""
+"""Writers of URDF elements, of numbers with twelve digits, and words for names."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import jinja2
 import numpy as np
 import pinocchio as pin
+
+from jumplab.forms import toml
 
 MOST_NAMES = 6  # that a sentence lists
 HERE = pin.SE3.Identity()
@@ -85,11 +82,6 @@ def add_boxes(
         add(add(shape, "geometry"), "box", size=size)
 
 
-def quote(value: Any) -> str:
-    """A text or an array of texts, the same in TOML as in JSON."""
-    return json.dumps(value, ensure_ascii=False)
-
-
 def listed(names: Iterable[Any]) -> str:
     """Names, or numbers, in quotes for a sentence, the first of many."""
     quoted = [*map(repr, names)]
@@ -99,17 +91,4 @@ def listed(names: Iterable[Any]) -> str:
 
 def key(name: str) -> str:
     """A name as a key of a TOML file: bare if it can be."""
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else quote(name)
-
-
-FORMS = jinja2.Environment(
-    loader=jinja2.FileSystemLoader(Path(__file__).parent),
-    trim_blocks=True,
-    keep_trailing_newline=True,
-)
-FORMS.filters |= {"toml": quote, "key": key}
-
-
-def filled(template: str, **values: Any) -> str:
-    """A template of this folder, a TOML file, with its fields filled in by Jinja."""
-    return FORMS.get_template(template).render(values)
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml(name)

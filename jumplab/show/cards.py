@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError, Shown
+from jumplab.forms import filled
 from jumplab.show.bodies import robot_sheet
 from jumplab.show.jumps import (
     active,
@@ -34,7 +35,6 @@ from jumplab.show.style import (
     themed,
 )
 from jumplab.show.tables import Table, table
-from jumplab.show.templates import render
 from jumplab.stages.plan import JumpPlan
 
 if TYPE_CHECKING:  # pictures need no simulator
@@ -63,7 +63,7 @@ def card(x: Shown) -> str | None:
         return None
     rows, picture = make(x)
     title = f"{type(x).__name__}: {x.line()}"
-    return render("card.html", title=title, rows=rows, picture=picture)
+    return filled("show/card.html", title=title, rows=rows, picture=picture)
 
 
 def _listed(values: Mapping[str, Any], heading: str = "value") -> Table:

@@ -20,13 +20,13 @@ from scipy.ndimage import uniform_filter1d
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.forms import filled
 from jumplab.io.files import settle, write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.io.progress import tell
 from jumplab.robot import Robot
 from jumplab.show.shapes import PAINTS, Trace, ground_forces, parts_of, trace
 from jumplab.show.style import INK
-from jumplab.show.templates import render
 from jumplab.sim.checks import ground_of
 from jumplab.sim.scene import Scene
 from jumplab.stages.plan import JumpPlan
@@ -82,7 +82,12 @@ class Movie:
         return write_file(path, self.data)
 
     def _repr_html_(self) -> str:
-        return render("movie.html", kind=self.kind, type=KINDS[self.kind][0], data=self.data)
+        return filled(
+            "show/movie.html",
+            kind=self.kind,
+            type=KINDS[self.kind][0],
+            data=self.data,
+        )
 
 
 def movie(

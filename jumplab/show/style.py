@@ -26,9 +26,9 @@ from matplotlib.lines import Line2D
 
 from jumplab.arguments import shaped
 from jumplab.errors import InputError, quoted
+from jumplab.forms import filled
 from jumplab.io.folder import versions, write_file
 from jumplab.robot import Robot
-from jumplab.show.templates import render
 from jumplab.show.waiting import show_waiting
 from jumplab.task import JumpTask
 
@@ -120,7 +120,7 @@ class Picture(Figure):
     def _repr_html_(self) -> str | None:
         if not self.caption:
             return None
-        return render("picture.html", png=self.png(), caption=self.caption)
+        return filled("show/picture.html", png=self.png(), caption=self.caption)
 
 
 def file_of(fig: Figure, kind: str, **how: Any) -> bytes:
@@ -289,7 +289,7 @@ def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -
     """Text of NAME.txt: caption, target (or targets), robot and versions, one line each."""
     tasks = [task] if isinstance(task, JumpTask) else task or ()
     facts = {"robot": robot, "made_with": made_with(), "caption": caption.strip()}
-    return render("caption.txt", tasks=[*map(describe_task, tasks)], **facts)
+    return filled("show/caption.txt", tasks=[*map(describe_task, tasks)], **facts)
 
 
 def describe_task(task: JumpTask) -> str:

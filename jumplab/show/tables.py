@@ -12,8 +12,8 @@ import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.forms import filled
 from jumplab.io import folder
-from jumplab.show.templates import render
 
 MOST_ROWS = 12  # of a table in a notebook; those below are folded
 DIGITS_MOST = 17  # a float has no more
@@ -38,7 +38,7 @@ class Table:
     def _repr_html_(self) -> str:
         sides = ["right" if right else "left" for right in self.right]
         facts = {"columns": self.columns, "rows": self.rows, "most": MOST_ROWS}
-        return render("table.html", sides=sides, **facts)
+        return filled("show/table.html", sides=sides, **facts)
 
 
 def table(

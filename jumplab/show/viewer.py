@@ -18,6 +18,7 @@ import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.forms import filled
 from jumplab.io.folder import write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.robot import Robot
@@ -25,7 +26,6 @@ from jumplab.robot.files import LEG
 from jumplab.show.bodies import ABOVE_M
 from jumplab.show.shapes import PAINTS, Part, Trace, ground_forces, parts_of, trace
 from jumplab.show.style import PHASE_COLORS, describe_task, made_with
-from jumplab.show.templates import FORMS, render
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
 
@@ -51,13 +51,17 @@ class Page:
         return write_file(path, self.html.encode())
 
     def _repr_html_(self) -> str:
-        return render("frame.html", page=self.html, title=self.title, height=NOTEBOOK_HEIGHT_PX)
+        return filled(
+            "show/frame.html",
+            page=self.html,
+            title=self.title,
+            height=NOTEBOOK_HEIGHT_PX,
+        )
 
 
-def filled(form: Path, title: str, **facts: Any) -> Page:
+def page_of(form: Path, title: str, **facts: Any) -> Page:
     """The page that a template of Jinja (the file ``form``) makes of ``facts``."""
-    page = FORMS.from_string(form.read_text(encoding="utf-8"))
-    return Page(page.render(title=title, made_with=made_with(), **facts), title)
+    return Page(filled(form, title=title, made_with=made_with(), **facts), title)
 
 
 def page(
@@ -127,7 +131,12 @@ def _assemble(title: str, facts: Mapping[str, Any]) -> str:
     if "</script" in engine:
         raise InputError("this version of meshcat cannot be put into a page; install another one")
     data = json.dumps(facts, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return render("page.html", title=title, engine=engine, facts=data.replace("<", "\\u003c"))
+    return filled(
+        "show/page.html",
+        title=title,
+        engine=engine,
+        facts=data.replace("<", "\\u003c"),
+    )
 
 
 def _ground(scene: Scene, span: tuple[float, float]) -> tuple[list[dict[str, Any]], float]:

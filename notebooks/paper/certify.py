@@ -30,7 +30,7 @@ from jumplab.io import folder as store
 from jumplab.robot import Robot
 from jumplab.show.style import LANDING, VERMILION, describe_task
 from jumplab.show.tables import table
-from jumplab.show.viewer import Page, filled
+from jumplab.show.viewer import Page, page_of
 from jumplab.sim import ENGINES, Perturbation, SensorNoise
 from jumplab.sim.engine import engine_class
 from jumplab.studies.study import Plain, Task, check_numbers, short_hash
@@ -328,7 +328,7 @@ def certify(
 
 def certificate_page(certificate: Certificate) -> Page:
     """A page without scripts of how far the engines are apart, by ``certify.html``."""
-    return filled(
+    return page_of(
         Path(__file__).with_suffix(".html"),
         f"Certificate: {describe_task(certificate.task)}",
         certificate=certificate,
