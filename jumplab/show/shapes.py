@@ -12,10 +12,10 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import coal
 import numpy as np
 import pinocchio as pin
 from scipy.ndimage import uniform_filter1d
-from scipy.spatial import ConvexHull
 
 from jumplab.control.kinematics import Gauge
 from jumplab.errors import RobotError
@@ -311,10 +311,9 @@ def _discs(robot: Robot) -> Iterator[Part]:
 
 def _hull(joint: int, kind: str, points: np.ndarray) -> Part:
     """The convex hull of points (n, 3), its triangles seen from outside."""
-    hull = ConvexHull(points)
-    corners = points[hull.simplices]
-    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    back = np.einsum("ij,ij->i", outwards, hull.equations[:, :3]) < 0
-    faces = np.where(back[:, None], hull.simplices[:, ::-1], hull.simplices)
-    kept, rows = np.unique(faces, return_inverse=True)
-    return Part(joint, kind, points[kept], rows.reshape(faces.shape))
+    corners = coal.StdVec_Vec3s()
+    corners.extend(points)
+    hull = coal.ConvexBase.convexHull(corners, True, "Qt")
+    faces = map(hull.polygons, range(hull.num_polygons))
+    triangles = [[face[k] for k in range(3)] for face in faces]
+    return Part(joint, kind, np.array(hull.points()), np.array(triangles))
