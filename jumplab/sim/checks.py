@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from scipy.ndimage import maximum_filter1d
 
 from jumplab.control.kinematics import Gauge, rotation, rotations
 from jumplab.robot.contact import on_feet
@@ -30,6 +31,7 @@ WINDOW = 100  # [steps] 0.1 s; a push shorter than that counts by its mean
 # [1] where a contact begins or ends, velocities swing within a step by some times what the log
 # shows
 SWING = 3.0
+CHATTER = 3  # [steps] this one, the one before and the one after, in which a contact may change
 # [rad/s] from here on dry friction is there in full: engines let it grow over some tenths
 SLIDES = 0.5
 STOP_RAD = 0.02  # this close to its stop, a joint may lean on it
@@ -89,7 +91,9 @@ def _largest_jump(result: SimulationResult) -> float:
     model = result.robot.model
     change = np.diff(result.v, axis=0)
     mean = result.v[:-1] + (1 + least) / 2 * change
-    room = SWING * (1 - least) * np.abs(change).max(axis=1) * STEP_S
+    # a foot that comes down chatters: it may swing within a step, and be back at its end
+    largest = maximum_filter1d(np.abs(change).max(axis=1), CHATTER)
+    room = SWING * (1 - least) * largest * STEP_S
     there = [pin.integrate(model, q, v * STEP_S) for q, v in zip(result.q[:-1], mean, strict=True)]
     miss = [pin.difference(model, a, b) for a, b in zip(there, result.q[1:], strict=True)]
     left = np.abs(miss) - room[:, None]
