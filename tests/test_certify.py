@@ -7,16 +7,15 @@ from types import SimpleNamespace
 
 import pytest
 from fixtures_core import jump
+from paper import certify as certificates
+from paper.certify import QUANTITIES, certificate_page, certify
 from test_store import names
 
 from jumplab.cli import main as cli
 from jumplab.errors import InputError, RobotError
 from jumplab.io import folder as store
-from jumplab.show.certificate import certificate_page
 from jumplab.sim import ENGINES, INSTALLED, Metrics, Perturbation
-from jumplab.studies import certify as certificates
 from jumplab.studies import trials as series
-from jumplab.studies.certify import QUANTITIES, certify
 
 pytestmark = pytest.mark.skipif(set(INSTALLED) != set(ENGINES), reason="a certificate needs every engine")
 LAID = {"plan.npz", "robot.toml", "robot.urdf", "summary.json"}
@@ -149,7 +148,7 @@ def test_a_plan_that_fails_its_audit_is_not_certified(folder, physics, monkeypat
     bad = SimpleNamespace(name="torque", passed=False)
     audit = SimpleNamespace(passed=False, checks=(bad,), failed=(bad,))
     monkeypatch.setattr(certificates, "audit", lambda *args, **options: audit)
-    found = certify(folder, 1, jobs=1, page=lambda c: certificate_page(c).html)
+    found = certify(folder, 1, jobs=1)
     assert found.failures == ["the plan fails the audit's check torque"]
     assert "Not certified." in (folder / "certificate.html").read_text()
 
@@ -217,7 +216,7 @@ def test_what_makes_no_certificate_says_why(folder, physics, monkeypatch, capsys
 
 
 def test_a_new_plan_takes_the_certificate_away(folder, physics):
-    certify(folder, 1, jobs=1, page=lambda c: certificate_page(c).html)
+    certify(folder, 1, jobs=1)
     plan = jump(0.6, 0.3, method="direct")
     store.write_plan(folder, plan.tape, plan.robot, plan.summary)
     assert held(folder) == LAID
@@ -244,7 +243,7 @@ def test_a_jump_that_does_not_get_so_far_is_no_agreement(folder, physics):
 def test_it_lands_on_the_contacts_of_both_engines(folder, physics):
     """Those that each has by default, and where it does not, no certificate is given."""
     physics.softly = lambda engine: {"landed": False, "reason": "fell"} if engine == "mujoco" else {}
-    found = certify(folder, 1, jobs=1, page=lambda c: certificate_page(c).html)
+    found = certify(folder, 1, jobs=1)
     assert found.failures == ["usual contact: mujoco does not land it: fell"] and not found.passed
     told = store.read_json(folder / "certificate.json")["usual_contact"]
     assert told["bullet"]["landed"] and told["mujoco"] == {"landed": False, "reason": "fell"}
@@ -256,7 +255,7 @@ def test_it_lands_on_the_contacts_of_both_engines(folder, physics):
 def test_a_plain_jump_is_certified(folder, monkeypatch):
     """All engines, for real, in one of the two modes."""
     monkeypatch.setattr(certificates, "MODES", ("position",))
-    found = certify(folder, 1, page=lambda c: certificate_page(c).html)
+    found = certify(folder, 1)
     assert found.passed, found.failures
     assert all(t.metrics.landed for mode in found.modes for pair in mode.pairs for t in pair.values())
     (impulses,) = [d for d in found.modes[0].differences if d["name"] == "vertical impulse of landing"]

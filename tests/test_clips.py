@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fixtures_core import jump
+from paper import clips, library
 from test_certify import measured
 from test_cli import one_sentence, run
 
@@ -14,11 +15,9 @@ from jumplab.errors import InfeasibleError, InputError
 from jumplab.io import folder as store
 from jumplab.robot import Robot
 from jumplab.robot.legs import segments_m
-from jumplab.show import library
 from jumplab.sim import DEFAULT_ENGINE, ENGINES, INSTALLED
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Contacts
-from jumplab.studies import clips
 from jumplab.task import JumpTask
 
 pytestmark = pytest.mark.skipif(set(INSTALLED) != set(ENGINES), reason="clips need every engine")

@@ -16,6 +16,7 @@ import matplotlib
 import numpy as np
 import pytest
 from fixtures_core import pendulum, planner
+from paper import running
 from papermill.iorw import load_notebook_node
 from papermill.parameterize import parameterize_notebook
 from test_store import make_tape
@@ -118,12 +119,12 @@ def runner(rng, folder):
         lambda: run({}, out=rng.choice(["/dev/null/x", "/proc/x", "x\0", ""])),
         lambda: run({}, figures="/dev/null/x"),
         lambda: run(rng.choice([3, "distance_m=1", [1]])),
-        lambda: notebooks.run_notebooks({}, notebooks=[folder / "none.ipynb"], out=folder / "o", progress=False),
+        lambda: running.run_notebooks({}, notebooks=[folder / "none.ipynb"], out=folder / "o", progress=False),
     ])  # fmt: skip
 
 
 def run(parameters, **folders):
-    return notebooks.run_notebooks(parameters, notebooks=SOURCES, progress=False, **folders)
+    return running.run_notebooks(parameters, notebooks=SOURCES, progress=False, **folders)
 
 
 API = [target, robot_name, plan_options, simulation, runner]

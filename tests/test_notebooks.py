@@ -15,6 +15,7 @@ import nbformat
 import numpy as np
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+from paper import running
 from PIL import Image
 
 from jumplab.cli import notebooks
@@ -74,7 +75,7 @@ def test_chain_in_an_odd_place_under_this_very_python(odd_folder, monkeypatch):
     second = "import pathlib\nassert pathlib.Path(out, 'seen_0.json').exists()" + RECORD % (1, 1)
     chain = [make_notebook(odd_folder, "00_first", RECORD % (0, 0)), make_notebook(odd_folder, "01_second", second)]
     monkeypatch.chdir("/")
-    report = notebooks.run_notebooks({"distance_m": 0.8, "n": 3}, notebooks=chain, progress=False)
+    report = running.run_notebooks({"distance_m": 0.8, "n": 3}, notebooks=chain, progress=False)
     assert report.notebooks == ("00_first", "01_second") and report.wall_s > 0
     assert report.out == odd_folder / "executed" and report.figures == report.out / "figures"
     seen = json.loads((report.out / "seen_1.json").read_text())
@@ -103,7 +104,7 @@ def test_figures_that_look_the_same_stay(tmp_path):
             (folder / name).write_text(text)
         (folder / "faint.txt").write_text(f"A caption, {text}.\nMade with a package.\n")
         (folder / "same.txt").write_text(f"A caption.\nMade with a package, {text}.\n")
-    notebooks.publish(work, out, figures)
+    running.publish(work, out, figures)
     texts = {path.name: path.read_text() for path in figures.iterdir() if path.suffix in (".txt", ".pdf")}
     assert texts.pop("same.txt").endswith("old.\n") and texts.pop("faint.txt").startswith("A caption, new.")
     assert texts == {"faint.pdf": "old", "other.txt": "new", "alone.txt": "new"}
@@ -132,7 +133,7 @@ def test_failing_notebook_stops_the_chain(tmp_path, cell, kind, sentence):
         make_notebook(tmp_path, "01_never", RECORD % (1, 1)),
     ]
     with pytest.raises(JumplabError) as e:
-        notebooks.run_notebooks(notebooks=chain, out=out, figures=figures, progress=False)
+        running.run_notebooks(notebooks=chain, out=out, figures=figures, progress=False)
     assert type(e.value) is kind
     assert "notebook 00_bad.ipynb" in str(e.value) and sentence in str(e.value) and "\n" not in str(e.value)
     assert names(figures) == ["old"]
@@ -162,7 +163,7 @@ def test_failing_notebook_stops_the_chain(tmp_path, cell, kind, sentence):
 def test_bad_parameters_are_refused_before_anything_runs(tmp_path, parameters, sentence):
     chain = [make_notebook(tmp_path, "00_first", RECORD % (0, 0))]
     with pytest.raises(InputError) as e:
-        notebooks.run_notebooks(parameters, notebooks=chain, progress=False)
+        running.run_notebooks(parameters, notebooks=chain, progress=False)
     assert str(e.value) == sentence
     assert names(tmp_path) == ["notebooks"]
 
@@ -177,7 +178,7 @@ def test_bad_parameters_are_refused_before_anything_runs(tmp_path, parameters, s
 def test_unwritable_folders_are_refused_before_anything_runs(tmp_path, arguments, sentence):
     chain = [make_notebook(tmp_path, "00_first", RECORD % (0, 0))]
     with pytest.raises(InputError, match=sentence):
-        notebooks.run_notebooks(notebooks=chain, progress=False, **arguments)
+        running.run_notebooks(notebooks=chain, progress=False, **arguments)
     assert names(tmp_path) == ["notebooks"]
 
 
@@ -194,18 +195,18 @@ def test_read_only_checkout_sends_everything_to_out(tmp_path, monkeypatch):
         return real(folder)
 
     monkeypatch.setattr(store, "ensure_writable", refuse_checkout)
-    report = notebooks.run_notebooks(notebooks=chain, out=out, progress=False)
+    report = running.run_notebooks(notebooks=chain, out=out, progress=False)
     assert report.figures == out / "figures"
     assert names(out) == ["figures", "notebooks", "seen_0.json"] and names(checkout) == ["notebooks"]
     with pytest.raises(InputError, match="read-only"):
-        notebooks.run_notebooks(notebooks=chain, progress=False)
+        running.run_notebooks(notebooks=chain, progress=False)
 
 
 def test_a_second_chain_in_one_folder_is_refused(tmp_path):
     chain = [make_notebook(tmp_path, "00_first", RECORD % (0, 0))]
     (tmp_path / "executed" / "notebooks").mkdir(parents=True)
     with store.locked(tmp_path / "executed" / "notebooks"), pytest.raises(InputError, match="another jumplab"):
-        notebooks.run_notebooks(notebooks=chain, progress=False)
+        running.run_notebooks(notebooks=chain, progress=False)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no ipc")
@@ -213,7 +214,7 @@ def test_kernels_need_no_ports(tmp_path):
     """Two that start at once could be given the same free one."""
     cell = "from ipykernel import get_connection_info\nassert get_connection_info(unpack=True)['transport'] == 'ipc'"
     paths = [make_notebook(tmp_path, f"0{k}_x", cell) for k in range(3)]
-    report = notebooks.run_notebooks(out=tmp_path / "out", notebooks=paths, progress=False, jobs=2)
+    report = running.run_notebooks(out=tmp_path / "out", notebooks=paths, progress=False, jobs=2)
     assert report.notebooks == ("00_x", "01_x", "02_x")
 
 
@@ -222,9 +223,9 @@ def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
     path.parent.mkdir()
     path.write_text("{")
     with pytest.raises(InputError, match=r"00_x\.ipynb: not a readable notebook"):
-        notebooks.run_notebooks(notebooks=[path], progress=False)
+        running.run_notebooks(notebooks=[path], progress=False)
     path.unlink()
-    monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", tmp_path)
+    monkeypatch.setattr(notebooks, "PLACES", [tmp_path / "notebooks", tmp_path / "jumplab" / "notebooks"])
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=r"^no notebooks in '.*notebooks' nor in '.*'; install jumplab again$"):
         notebooks.find_notebooks()
@@ -234,14 +235,14 @@ def test_some_notebooks_alone_leave_the_others_as_they_are(tmp_path, monkeypatch
     """By number or by name, in their order; only a notebook that is no more loses its executed copy."""
     for k, stem in enumerate(("00_first", "01_second", "02_third")):
         make_notebook(tmp_path, stem, RECORD % (k, k))
-    monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", tmp_path)
+    monkeypatch.setattr(notebooks, "PLACES", [tmp_path / "notebooks"])
     chosen = notebooks.find_notebooks(["02_third", "00"])
     assert [p.stem for p in chosen] == ["00_first", "02_third"]
     executed = tmp_path / "executed" / "notebooks"
     executed.mkdir(parents=True)
     for stem in ("01_second", "07_gone"):
         (executed / f"{stem}.ipynb").write_text("old")
-    notebooks.run_notebooks(notebooks=chosen, progress=False)
+    running.run_notebooks(notebooks=chosen, progress=False)
     assert names(executed) == ["00_first.ipynb", "01_second.ipynb", "02_third.ipynb"]
     with pytest.raises(InputError, match=r"^no notebook '03'; there are 00_first, 01_second, 02_third$"):
         notebooks.find_notebooks(["01", "03"])
@@ -255,7 +256,7 @@ def test_interrupted_chain_leaves_nothing_behind(tmp_path, number):
     make_notebook(tmp_path, "00_sleep", RECORD % (0, 0), sleeper)
     code = (
         f"import sys; from pathlib import Path; sys.path.insert(0, {str(ROOT)!r}); from jumplab.cli import notebooks;"
-        f"notebooks._PACKAGE_PARENT = Path({str(tmp_path)!r}); from jumplab.cli.main import main;"
+        f"notebooks.PLACES = [Path({str(tmp_path)!r}) / 'notebooks']; from jumplab.cli.main import main;"
         f"sys.exit(main(['run', '-p', 'n=2']))"
     )
     env = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -287,14 +288,14 @@ def wait_for(condition, seconds=60.0):
 
 def test_what_a_notebook_asks_is_known_before_it_runs(tmp_path):
     """Types and ranges of the parameters stand in the notebook."""
-    asked = {p.name[:2]: notebooks.declared_parameters(p) for p in SOURCES}
+    asked = {p.name[:2]: running.declared_parameters(p) for p in SOURCES}
     assert asked["01"]["samples"] == range(1, 10_001) and asked["05"]["fast"] is bool
     chain = [make_notebook(tmp_path, "00_x", parameters=f"{PARAMETERS}  # 2 ... 4, how many\nm: dict = {{}}")]
-    declared = notebooks.declared_parameters(chain[0])
+    declared = running.declared_parameters(chain[0])
     assert declared["n"] == range(2, 5) and declared["m"] is None and declared["distance_m"] is float
     for value, said in ((5, "must be 2 ... 4, got 5"), (2.5, "must be a whole number, got 2.5")):
         with pytest.raises(InputError) as e:
-            notebooks.run_notebooks({"n": value}, notebooks=chain, progress=False)
+            running.run_notebooks({"n": value}, notebooks=chain, progress=False)
         assert str(e.value) == f"parameter n {said}" and names(tmp_path) == ["notebooks"]
 
 
@@ -318,7 +319,7 @@ def test_source_notebook_keeps_the_house_rules(stem):
     code = [c for c in nb.cells if c.cell_type == "code"]
     assert nb.cells[0].cell_type == "markdown" and nb.cells[0].source.startswith("# ")
     assert all(not c.outputs and c.execution_count is None for c in code), "commit notebooks without outputs"
-    assert set(notebooks.STANDARD) <= set(notebooks.declared_parameters(path))
+    assert set(running.STANDARD) <= set(running.declared_parameters(path))
     assert any("check_parameters(" in c.source for c in code)
     most = 10 if stem == "03_joint_space_mapping" else 25  # the lesson: one idea a cell
     for cell in code:
@@ -373,7 +374,7 @@ def f():
 def chain(tmp_path_factory):
     """The whole chain once, from another folder, into a path with a space and letters beyond ASCII."""
     folder = tmp_path_factory.mktemp("chain") / "voll ständig"
-    return notebooks.run_notebooks(SMALL, out=folder / "out", figures=folder / "figures", progress=False)
+    return running.run_notebooks(SMALL, out=folder / "out", figures=folder / "figures", progress=False)
 
 
 def test_chain_runs_and_publishes(chain):

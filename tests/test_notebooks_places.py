@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from paper import running
 from test_notebooks import RECORD, make_notebook, names, wait_for
 
 from jumplab.cli import notebooks
@@ -40,6 +41,7 @@ def read_only(odd_folder):
     checkout.mkdir()
     shutil.copytree(ROOT / "jumplab", checkout / "jumplab", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copyfile(ROOT / "pyproject.toml", checkout / "pyproject.toml")
+    shutil.copytree(ROOT / "notebooks" / "paper", checkout / "notebooks" / "paper")
     make_notebook(checkout, "00_first", RECORD % (0, 0), "assert 'DISPLAY' not in os.environ")
     make_notebook(
         checkout, "01_second", "import pathlib\nassert pathlib.Path(out, 'seen_0.json').exists()" + RECORD % (1, 1)
@@ -88,7 +90,7 @@ def test_killed_runner_takes_its_kernel_along(tmp_path):
     sleeper = f"import os, pathlib, time\npathlib.Path({str(pid_file)!r}).write_text(str(os.getpid()))\ntime.sleep(300)"
     path = make_notebook(tmp_path, "00_sleep", RECORD % (0, 0), sleeper)
     there = f"sys.path.insert(0, {str(ROOT)!r}); from pathlib import Path; from jumplab.cli import notebooks;"
-    there += f"notebooks._PACKAGE_PARENT = Path({str(tmp_path)!r})"
+    there += f"notebooks.PLACES = [Path({str(tmp_path)!r}) / 'notebooks']"
     process = run_there(ROOT, "--out", tmp_path / "out", code=there)
     wait_for(lambda: process.poll() is not None or (pid_file.exists() and pid_file.read_text()))
     process.send_signal(signal.SIGKILL)
@@ -96,7 +98,7 @@ def test_killed_runner_takes_its_kernel_along(tmp_path):
     wait_for(lambda: not alive(int(pid_file.read_text())))
     path.unlink()
     chain = [make_notebook(tmp_path, "00_quick", RECORD % (0, 0))]
-    notebooks.run_notebooks(notebooks=chain, out=tmp_path / "out", progress=False)
+    running.run_notebooks(notebooks=chain, out=tmp_path / "out", progress=False)
     assert names(tmp_path / "out") == ["figures", "notebooks", "seen_0.json"]
 
 
@@ -113,7 +115,7 @@ def test_finished_chain_leaves_no_process(tmp_path):
     pids = tmp_path / "pids"
     report = f"import os, pathlib\npathlib.Path({str(pids)!r}).open('a').write(f'{{os.getpid()}}\\n')"
     chain = [make_notebook(tmp_path, f"0{k}_x", report) for k in range(2)]
-    notebooks.run_notebooks(notebooks=chain, progress=False)
+    running.run_notebooks(notebooks=chain, progress=False)
     found = [int(x) for x in pids.read_text().split()]
     assert len(set(found)) == 2 and not any(alive(pid) for pid in found)
 
@@ -123,8 +125,8 @@ def test_an_installed_package_brings_its_notebooks(tmp_path, monkeypatch):
     package = tmp_path / "site-packages" / "jumplab"
     package.mkdir(parents=True)
     make_notebook(package, "00_first")
-    monkeypatch.setattr(notebooks, "_PACKAGE", package)
-    monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", package.parent)
+    monkeypatch.setattr(notebooks, "PACKAGE", package)
+    monkeypatch.setattr(notebooks, "PLACES", [root / "notebooks" for root in (package.parent, package)])
     monkeypatch.chdir(tmp_path)
     found = notebooks.find_notebooks()
     assert [p.name for p in found] == ["00_first.ipynb"] and found[0].is_relative_to(package)

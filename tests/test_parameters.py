@@ -1,6 +1,7 @@
 """Parameters that a notebook's first cells refuse, and those that they accept."""
 
 import pytest
+from paper import running
 
 from jumplab.cli import notebooks
 from jumplab.errors import InputError
@@ -26,7 +27,7 @@ n: int = 1  # 1 ... 9, how many"""
 )
 def test_check_parameters_refuses(injected, sentence):
     with pytest.raises(InputError) as e:
-        notebooks.check_parameters(opened(injected))
+        running.check_parameters(opened(injected))
     assert str(e.value).startswith(sentence)
 
 
@@ -42,18 +43,18 @@ def test_an_engine_is_looked_for_before_anything_runs(tmp_path):
 
     words = f"^engine 'ode': must be one of {', '.join(INSTALLED)}$"
     with pytest.raises(InputError, match=words):
-        notebooks.check_parameters(opened("engine = 'ode'", f"{DECLARED}\nengine: str = 'bullet'"))
+        running.check_parameters(opened("engine = 'ode'", f"{DECLARED}\nengine: str = 'bullet'"))
     with pytest.raises(InputError, match=r"^unknown notebook parameter 'engine'"):  # a notebook that simulates nothing
-        notebooks.check_parameters(opened("engine = 'ode'"))
+        running.check_parameters(opened("engine = 'ode'"))
     with pytest.raises(InputError, match=words):
-        notebooks.run_notebooks({"engine": "ode"}, notebooks=notebooks.find_notebooks(["00"]), out=tmp_path / "out")
+        running.run_notebooks({"engine": "ode"}, notebooks=notebooks.find_notebooks(["00"]), out=tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
 def test_check_parameters_accepts_what_is_meant():
-    notebooks.check_parameters({"distance_m": 1, "height_m": 0.3, "robot": "bhr", "later": 3, "In": ["later = 3"]})
+    running.check_parameters({"distance_m": 1, "height_m": 0.3, "robot": "bhr", "later": 3, "In": ["later = 3"]})
     namespace = {"In": ["", DECLARED.replace("n: int = 1", "n: int = 0")]}  # edited by hand, without papermill
     exec(namespace["In"][1], namespace)
     with pytest.raises(InputError, match=r"^parameter n must be 1 \.\.\. 9, got 0$"):
-        notebooks.check_parameters(namespace)
-    notebooks.check_parameters(opened("fast = True\nrobot = 'a = b'\nn = 3", f"{DECLARED}\nfast: bool = False"))
+        running.check_parameters(namespace)
+    running.check_parameters(opened("fast = True\nrobot = 'a = b'\nn = 3", f"{DECLARED}\nfast: bool = False"))

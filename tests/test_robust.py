@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
+from paper.margins import ranges_at
 
 import jumplab as jl
 from jumplab.errors import InputError
@@ -20,7 +21,6 @@ from jumplab.stages.whole_body import Limits
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.instant import Instant
 from jumplab.studies import robust
-from jumplab.studies.margins import ranges_at
 
 TASK = jl.JumpTask(1.0, 0.5)
 

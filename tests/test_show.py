@@ -216,7 +216,7 @@ def test_a_notebook_shows_the_caption_below_a_saved_figure(tmp_path):
     before = DisplayFormatter().format(fig)[0]
     plotting.save_figure(fig, "x", tmp_path, 'Torque < limit, "dashed".')
     after = DisplayFormatter().format(fig)[0]
-    words = "Torque &lt; limit, &quot;dashed&quot;."
+    words = "Torque &lt; limit, &#34;dashed&#34;."
     assert "image/png" in before and "text/html" not in before and "image/png" not in after
     assert f'alt="{words}"' in after["text/html"] and f"<figcaption>{words}</figcaption>" in after["text/html"]
     assert fig.png() == (tmp_path / "x.png").read_bytes()

@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fixtures_core import import_graph, jump
+from paper import margins
+from paper.margins import margin_chart
+from paper.runs import features
 from test_store import make_tape, names
 
 from jumplab.errors import InputError, SolverError
 from jumplab.io import folder as store
-from jumplab.show import margin_chart
 from jumplab.sim import Finding, Perturbation, Ranges, Scene, SensorNoise, Sign, SimulationResult, signs
-from jumplab.studies import margins
 from jumplab.studies import study as studies
 from jumplab.studies import trials as monte_carlo
 from jumplab.studies.trials import PlanOnFile, Trial, TrialKey, TrialSettings, run_trials, wilson
@@ -58,7 +59,7 @@ def play(plan, settings, key):
     robot = plan.robot
     drawn = Perturbation.draw(robot, key.robot_seed)
     reason = "stood" if toss < 0.7 else f"left_arm touched the ground {toss:.2f} s after touchdown"
-    return Trial(key, {}, monte_carlo.features(drawn, robot), toss < 0.7, reason, None)
+    return Trial(key, {}, features(drawn, robot), toss < 0.7, reason, None)
 
 
 @pytest.fixture
@@ -84,7 +85,7 @@ def test_a_trial_is_the_simulation_it_says(real):
     assert trial.metrics.landed == trial.landed and trial.metrics.com_rise_m == pytest.approx(0.3, abs=0.05)
     kept = json.dumps(trial.to_json())
     assert json.dumps(Trial.from_json(json.loads(kept)).to_json()) == kept
-    f = trial.features
+    f = features(drawn, robot)
     assert (f["friction"], f["delay_s"]) == (drawn.friction, drawn.delay_s)
     assert drawn.robot(robot).total_mass == pytest.approx(robot.total_mass * (1 + f["mass"]))
 
@@ -92,10 +93,10 @@ def test_a_trial_is_the_simulation_it_says(real):
 def test_features_of_a_shift_of_every_link(bhr):
     """All links' centres of mass moved alike, nothing turned but the legs: the whole robot's moves as its trunk's."""
     links = Perturbation.draw(bhr, 0).com
-    shifted = monte_carlo.features(Perturbation(com=dict.fromkeys(links, (0.0, 0.01, 0.0))), bhr)
+    shifted = features(Perturbation(com=dict.fromkeys(links, (0.0, 0.01, 0.0))), bhr)
     assert shifted["com_y_m"] == pytest.approx(0.01, rel=1e-3) and shifted["mass"] == 0
     weak = Perturbation(motor_gain=dict.fromkeys(bhr.joint_names, 0.97))
-    assert monte_carlo.features(weak, bhr)["leg_motors"] == pytest.approx(-0.03)
+    assert features(weak, bhr)["leg_motors"] == pytest.approx(-0.03)
 
 
 def test_a_lost_robot_is_a_failure(folder, monkeypatch):

@@ -18,6 +18,7 @@ import joblib
 import numpy as np
 import psutil
 import pytest
+from paper import clips
 from test_store import make_summary, make_tape
 from test_urdf_checks import TEXTS
 from together import together
@@ -29,7 +30,7 @@ from jumplab.io import folder as store
 from jumplab.io.files import ensure_writable, locked, open_log
 from jumplab.ocp import cache
 from jumplab.sim import Scene
-from jumplab.studies import clips, sweep
+from jumplab.studies import sweep
 from jumplab.studies.study import in_parallel, open_study
 
 ROOT = Path(__file__).resolve().parent.parent

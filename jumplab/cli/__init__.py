@@ -2,7 +2,7 @@
 reading in ``main``.
 
 ``options.toml`` lists what can be typed, ``common`` makes parsers of it; ``jumps``, ``studies`` and
-``robots`` hold the commands; ``notebooks`` checks what a notebook was given, and runs them.
+``robots`` hold the commands, ``notebooks`` finds the others, which stand beside the notebooks.
 """
 
 from jumplab.cli.notebooks import check_parameters as check_parameters

@@ -1,6 +1,5 @@
-"""The commands about one jump and its folder: run, plan, audit, simulate, view, export."""
+"""The commands about one jump and its folder: plan, audit, simulate, view, export."""
 
-import ast
 import json
 import time
 import warnings
@@ -11,50 +10,15 @@ from typing import Any
 
 import jumplab as jl
 from jumplab import io, sim, studies
-from jumplab.cli import notebooks
 from jumplab.cli.common import (
     disturbances,
     given,
     judge,
-    named,
     print_simulation,
     print_summary,
     without,
 )
-from jumplab.errors import InputError
 from jumplab.task import JumpTask
-
-
-def run(args: Namespace) -> None:
-    """Execute the notebooks: plan, audit, simulation, figures."""
-    task = JumpTask(args.distance_m, args.height_m)
-    values = {"distance_m": task.distance_m, "height_m": task.height_m, "robot": args.robot}
-    if args.engine is not None:
-        values["engine"] = args.engine
-    for pair in args.parameter:
-        name, text = named("--parameter must be NAME=VALUE", pair)
-        if name in values:
-            raise InputError(
-                f"--parameter {name} is given twice, or has an option of its own; set it once"
-            )
-        try:
-            values[name] = ast.literal_eval(text)
-        except (ValueError, SyntaxError, MemoryError, RecursionError):
-            values[name] = text
-    options = given(notebooks.run_notebooks, args, progress="quiet" not in args)
-    chosen = notebooks.find_notebooks(args.notebook)
-    report = notebooks.run_notebooks(values, notebooks=chosen, **options)
-    args.found |= vars(report)
-    if (report.out / "plan.npz").is_file():
-        args.found["plan"] = io.folder.read_plan(report.out)[2]
-        print_summary(args.found["plan"])
-    if (report.out / "simulation.json").is_file():
-        args.found["simulation"] = io.folder.read_json(report.out / "simulation.json")
-        print_simulation(args.found["simulation"])
-    print(f"figures in {report.figures}, results and executed notebooks in {report.out}")
-    if (report.out / "jump.html").is_file():
-        print(f"the jump in 3-D, for any browser: {report.out / 'jump.html'}")
-    print(f"whole run: {report.wall_s:.1f} s")
 
 
 def plan(args: Namespace) -> None:

@@ -18,22 +18,12 @@ from typing import Any, NoReturn
 
 from jumplab.cli.common import add_common, declare
 from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_soon
-from jumplab.cli.jumps import audit, export, plan, run, simulate, view
+from jumplab.cli.jumps import audit, export, plan, simulate, view
 from jumplab.cli.motions import judge, mend
+from jumplab.cli.notebooks import beside
 from jumplab.cli.robots import check, list_, robot
 from jumplab.cli.streams import patient_streams
-from jumplab.cli.studies import (
-    atlas,
-    bench,
-    certify,
-    chain,
-    clips,
-    envelope,
-    margins,
-    record,
-    sweep,
-    trials,
-)
+from jumplab.cli.studies import atlas, chain, envelope, record, sweep, trials
 from jumplab.errors import InputError, JumplabError
 from jumplab.show.waiting import on_terminal
 
@@ -48,6 +38,19 @@ def completion(args: argparse.Namespace) -> None:
     print(args.found["script"])
 
 
+run = beside("run", "Execute the notebooks: plan, audit, simulation, figures.")
+margins = beside("margins", "Find the largest size of each disturbance that a plan tolerates.")
+certify = beside(
+    "certify",
+    "Certify a plan: audit, then both physics engines in some modes, with both contacts.",
+)
+clips = beside(
+    "clips",
+    "Make a library of clips: a hundred jumps to all sides, audited and landed in both engines.",
+)
+bench = beside(
+    "bench", "Measure the time of planning, one kind of jump and one method after another."
+)
 COMMANDS = (run, plan, audit, simulate, trials, margins, certify, chain, clips, judge, mend)
 COMMANDS += (view, export)
 COMMANDS += (robot, record, envelope, atlas, sweep, bench, completion)

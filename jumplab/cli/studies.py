@@ -1,8 +1,5 @@
-"""The commands about many jumps: trials, margins, certify, clips, chain, envelope, atlas, sweep,
-bench.
-"""
+"""The commands about many jumps: trials, chain, envelope, record, atlas, sweep."""
 
-import json
 import math
 from argparse import Namespace
 from dataclasses import asdict
@@ -21,7 +18,6 @@ from jumplab.cli.common import (
 )
 from jumplab.cli.notebooks import paper
 from jumplab.errors import InfeasibleError, InputError
-from jumplab.io.progress import tell
 from jumplab.task import JumpTask
 
 TARGET = "distance_m", "height_m", "platform_m", "side_m", "yaw_rad", "gravity"
@@ -38,7 +34,7 @@ def trials(args: Namespace) -> None:
         without(args, "corrects the launch, but --basin begins in flight", feedback=False)
     ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    options = {"folder": args.dir, "settings": _settings(args, noise=noise, ranges=ranges)}
+    options = {"folder": args.dir, "settings": settings_of(args, noise=noise, ranges=ranges)}
     if args.basin:
         report = resumed(paper("basin").landing_basin, args, **options)
     else:  # 200: a success rate near 95 % is then known to 3 % on either side
@@ -61,72 +57,9 @@ def trials(args: Namespace) -> None:
     print(f"{name}.json in {args.dir}, {report.resumed} trials from an earlier run")
 
 
-def _settings(args: Namespace, **more: Any) -> Any:
+def settings_of(args: Namespace, **more: Any) -> Any:
+    """Settings of trials, as the options have them."""
     return studies.trials.TrialSettings(**given(studies.trials.TrialSettings, args, **more))
-
-
-def margins(args: Namespace) -> None:
-    """Find the largest size of each disturbance that a plan tolerates."""
-    names = args.disturb or (*studies.margins.SINGLE, *studies.margins.PAIRS)
-    options = {"folder": args.dir, "seed": args.seed or 0, "settings": _settings(args)}
-    report = resumed(studies.margins.margins, args, names=names, **options)
-    args.found |= report.to_json()
-    print(jl.plots.table([margin.row() for margin in report.margins], digits=3))
-    print(f"{report.line()}; margins.json in {args.dir}")
-
-
-def certify(args: Namespace) -> None:
-    """Certify a plan: audit, then both physics engines in some modes, with both contacts."""
-
-    def page(certificate: Any) -> str:
-        return jl.plots.certificate_page(certificate).html
-
-    options = {"folder": args.dir, "seed": args.seed or 0, "page": page}
-    certificate = resumed(studies.certify.certify, args, **options)
-    args.found |= certificate.to_json()
-    for mode in certificate.modes:
-        print(f"{mode.mode} mode: the engines {'agree' if mode.agree else 'do not agree'}")
-        print(jl.plots.table(mode.differences, studies.certify.COLUMNS, digits=3))
-        landed = ", ".join(f"{count} in {name}" for name, count in mode.landed.items())
-        print(
-            f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} have the same "
-            f"outcome"
-        )
-    for engine, trial in certificate.usual.items():
-        print(f"usual contact, {engine}: {trial.reason}")
-    print(
-        f"certificate.json and certificate.html in {args.dir}, {certificate.resumed} simulations "
-        f"from an earlier run"
-    )
-    if failures := certificate.failures:
-        more = f"; and {len(failures) - 1} more" if len(failures) > 1 else ""
-        raise InfeasibleError(
-            f"not certified: {failures[0]}{more}; see certificate.html in {args.dir!r}"
-        )
-    checks = len(certificate.audit.checks)
-    print(
-        f"certified: all {checks} checks of the audit passed, and the engines agree that it lands "
-        f"({certificate.scope})"
-    )
-
-
-def clips(args: Namespace) -> None:
-    """Make a library of clips: a hundred jumps to all sides, audited and landed in both engines."""
-
-    def page(index: Any) -> str:
-        return jl.plots.clips_page(index).html
-
-    draw = jl.plots.draw_film if args.films else jl.plots.draw_strip
-    vary = choices_of("--vary must be WHAT", args.vary) if args.vary else []
-    options = {"format_name": args.format, "vary": vary, "draw": draw, "page": page, "say": print}
-    library = resumed(studies.clips.make_clips, args, "clips", **options)
-    args.found |= {"out": args.out} | library
-    passed = len(library["clips"])
-    count = passed + len(library["left_out"])
-    print(f"{passed} of {count} clips passed; index.json and index.html in {args.out}")
-    if not passed:
-        reason = library["left_out"][0]["reasons"][0]
-        raise InfeasibleError(f"no clip of {args.robot.name} passed: {reason}")
 
 
 def chain(args: Namespace) -> None:
@@ -310,16 +243,3 @@ def sweep(args: Namespace) -> None:
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
     outcome = f"{planned} planned, {clean} passed the audit"
     print(f"{len(rows)} cases, {outcome}; table in {table}")
-
-
-def bench(args: Namespace) -> None:
-    """Measure the time of planning, one kind of jump and one method after another."""
-    task = JumpTask(args.distance_m, args.height_m)
-    benchmark = paper("planning_times")
-    times = benchmark.bench(args.robot, task, args.repeats, say=tell)
-    args.found |= times
-    print(jl.plots.table(times["rows"], benchmark.COLUMNS, digits=3))
-    if args.out is not None:
-        io.folder.settle()
-        io.folder.write_file(args.out, json.dumps(times, indent=1).encode())
-        print(f"raw times in {args.out}")

@@ -8,7 +8,6 @@ import pickle
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import resources
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.forms import filled
 from jumplab.io import gains
 from jumplab.io.columns import table_of
 from jumplab.io.folder import FORMATS, MESH, WITH_OBJECT, transaction, write_file
@@ -27,8 +27,6 @@ from jumplab.robot import Robot
 
 HELD_RAD = 0.02  # by which joints that a format leaves out may move
 LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
-# of a box, around the numbers of its corners, seen from outside
-FACES = "1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"
 PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
 
 
@@ -91,10 +89,8 @@ def _write_mesh(path: Path, block: tuple[np.ndarray, np.ndarray, float] | None) 
     if block is None:
         path.unlink(missing_ok=True)
         return
-    corners = product(*((-half, half) for half in block[0]))
-    lines = ["v {:.9g} {:.9g} {:.9g}".format(*corner) for corner in corners]
-    lines += [f"f {around}" for around in FACES]
-    write_file(path, "\n".join(["o platform", *lines, ""]).encode())
+    text = filled("io/platform.obj.in", ends=np.outer(block[0], [-1.0, 1.0]))
+    write_file(path, text.encode())
 
 
 def _encoded(ending: str, content: Any) -> bytes:
@@ -321,17 +317,13 @@ def animated(whole: Whole, x: Motion, fps: float) -> str:
 
 def pybullet_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     """The URDF, the trajectory, and a script of ten lines that shows it."""
-    texts = resources.files("jumplab.io")
-    script = (texts / "replay.py.txt").read_text(encoding="utf-8")
-    readme = (texts / "replay.md").read_text(encoding="utf-8")
-    marks = {"SCRIPT": script.strip(), "SOURCE": x.source, "ROBOT": whole.robot.name}
-    for mark, words in marks.items():
-        readme = readme.replace(f"@@{mark}@@", words)
+    script = (resources.files("jumplab.io") / "replay.py.txt").read_text(encoding="utf-8")
+    words = {"script": script.strip(), "source": x.source, "robot": whole.robot.name}
     return {
         "robot.urdf": whole.urdf,
         "trajectory.npz": {"hz": np.array(fps), **plain_arrays(whole, x, fps)},
         "replay.py": script,
-        "README.md": readme,
+        "README.md": filled("io/replay.md", **words),
     }
 
 

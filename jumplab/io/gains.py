@@ -73,7 +73,7 @@ class Dynamics:
         """Accelerations, and contact forces with their sign turned (nv + rows, ...), of right-hand
         sides of that size, by ``jacobians`` (rows, nv) of each foot.
         """
-        mass = np.triu(self.data.M) + np.triu(self.data.M, 1).T
+        mass = self.data.M
         rows = np.vstack([np.zeros((0, len(mass))), *jacobians])
         return np.linalg.solve(
             np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]]), right

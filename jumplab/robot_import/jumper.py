@@ -19,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.forms import filled
 from jumplab.robot.description import Robot
 from jumplab.robot.files import (
     LEG,
@@ -38,11 +39,7 @@ from jumplab.robot_import.write import (
     add_boxes,
     add_joint,
     add_link,
-    filled,
-    quote,
-    rows,
     shifted,
-    titled,
 )
 
 # None of these numbers is printed by the paper. Boxes have the default robot's proportions, as
@@ -248,12 +245,12 @@ def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
     ET.indent(robot)
     place = shifted(-trunk.place) * lumped.placed[root]
     return filled(
-        "published.toml.in",
-        trunk=quote(root),
-        xyz=", ".join(f"{x:.12g}" for x in 0.0 + place.translation),
-        rpy=", ".join(f"{x:.12g}" for x in 0.0 + pin.rpy.matrixToRpy(place.rotation)),
+        "robot_import/published.toml.in",
+        trunk=root,
+        xyz=0.0 + place.translation,
+        rpy=0.0 + pin.rpy.matrixToRpy(place.rotation),
         urdf=ET.tostring(robot, encoding="unicode"),
-        held=rows(dict(sorted(lumped.held.items()))),
+        held=lumped.held,
     )
 
 
@@ -423,24 +420,24 @@ def _toml(
             f"robot configuration: [rest] names the joint {unknown[0]!r}, which does not move; "
             f"correct or remove it"
         )
-    motors = ""
+    motors = {}
     for key in MOTOR:
         told = {b.joint: b.limits for b in lumped.bodies.values() if key in b.limits}
         if key in RATIOS:  # speeds as shares of the speed limit
             values = {joint: x[key] / x["velocity"] for joint, x in told.items()}
         else:
             values = {joint: x[key] for joint, x in told.items()}
-        motors += titled(f"actuators.{RATIOS.get(key, key)}", values)
+        motors[RATIOS.get(key, key)] = values
     return filled(
-        "jumper.toml.in",
+        "robot_import/jumper.toml.in",
         name=entry(config, "name", kind=str),
         sha256=hashlib.sha256(urdf.encode()).hexdigest(),
-        held=", ".join(f"{k} = {v:g}" for k, v in sorted(lumped.held.items())) or "all at 0",
-        joints="\n".join(f"{role} = {quote(pair)}" for role, pair in roles.items()),
-        links=quote(feet),
+        held=lumped.held,
+        joints=roles,
+        links=feet,
         sole=sole,
-        stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE)
-        + titled("rest", rest),
+        stance={key: entry(config, "stance", key) for key in STANCE},
+        rest=rest,
         corner=entry(config, "actuators", "corner_speed_ratio"),
-        corners=motors,
+        motors=motors,
     )

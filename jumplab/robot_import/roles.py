@@ -17,6 +17,7 @@ import numpy as np
 from numpy.linalg import norm
 
 from jumplab.errors import RobotError
+from jumplab.forms import filled
 from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import.checks import (
     MOST_RAD,
@@ -29,7 +30,7 @@ from jumplab.robot_import.checks import (
 )
 from jumplab.robot_import.feet import Sole, find_sole, refuse_wheel, sole_points, thickness
 from jumplab.robot_import.urdf import MOVING, Joint, Tree, read_urdf
-from jumplab.robot_import.write import filled, key, listed, quote
+from jumplab.robot_import.write import key, listed
 
 # None of these numbers is printed by the paper.
 SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
@@ -512,41 +513,30 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
         for note in (*notes(tree), *dict.fromkeys(tree.notes)):
             e.add_note(note)
         raise
-    assumed = "".join(
-        f"\n[assumed.{key(joint)}]  # holds where [limits] has no number\n"
-        + "".join(f"{part} = {x:g}\n" for part, x in limits.items())
-        for joint, limits in roles.assumed.items()
-    )
-    asked = ""
+    asked = {}  # table -> limits that the file lacks
     faults = []
     names = [name for pair in roles.joints.values() for name in pair]
     for joint in dict.fromkeys(names + leg_joints(tree, roles.trunk, roles.feet)):
         given = roles.assumed.get(joint, {})
         title = f"limits.{key(joint)}"
         if parts := keys_of(wrong_limits(tree, joint, given)):
-            asked += f"# [{title}]\n" + "".join(f"# {part} =\n" for part in parts)
+            asked[title] = parts
         faults += limit_faults(tree, joint, given, title)
     # a short name of letters, digits, - and _
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
     config = filled(
-        "starter.toml.in",
-        notes="".join(f"# note: {note}\n" for note in roles.notes),
+        "robot_import/starter.toml.in",
+        key=key,
+        notes=roles.notes,
         name=name or "robot",
-        urdf=quote(path.resolve().as_posix()),
+        urdf=path.resolve().as_posix(),
         roles=roles,
-        repair=quote(repair),
-        joints="\n".join(f"{role} = {quote(roles.joints[role])}" for role in ROLES),
-        feet=quote(roles.feet),
+        repair=repair,
         sole=sole,
-        level=f"level_rad = {sole.level:.4g}  # of the ankles, about the axis to the left\n"
-        * bool(sole.level),
-        trunk_link=quote(roles.trunk),
         other=roles.forward.translate(str.maketrans("+-", "-+")),
         knee=_inside(tree, turn[1], roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
-        assumed=assumed,
-        asked=asked
-        and f"\n# NEEDED: take away the # and put in the numbers [N m, rad/s, rad]\n{asked}",
+        asked=asked,
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
     roles = replace(roles, notes=(*notes(tree), *dict.fromkeys(tree.notes), *roles.notes))

@@ -1,18 +1,16 @@
-"""Writers of URDF elements, of numbers with twelve digits, and of TOML files from the templates of
-this folder.
-"""
+"""Writers of URDF elements, of numbers with twelve digits, and words for names."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
+
+from jumplab.forms import toml
 
 MOST_NAMES = 6  # that a sentence lists
 HERE = pin.SE3.Identity()
@@ -84,16 +82,6 @@ def add_boxes(
         add(add(shape, "geometry"), "box", size=size)
 
 
-def filled(template: str, **values: Any) -> str:
-    """A template of this folder with its fields filled in (as :meth:`str.format` does)."""
-    return Path(__file__).with_name(template).read_text(encoding="utf-8").format(**values)
-
-
-def quote(value: Any) -> str:
-    """A text or an array of texts, the same in TOML as in JSON."""
-    return json.dumps(value, ensure_ascii=False)
-
-
 def listed(names: Iterable[Any]) -> str:
     """Names, or numbers, in quotes for a sentence, the first of many."""
     quoted = [*map(repr, names)]
@@ -103,14 +91,4 @@ def listed(names: Iterable[Any]) -> str:
 
 def key(name: str) -> str:
     """A name as a key of a TOML file: bare if it can be."""
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else quote(name)
-
-
-def rows(values: Mapping[str, float]) -> str:
-    """Lines of a table, name = number."""
-    return "\n".join(f"{quote(name)} = {value:.12g}" for name, value in values.items())
-
-
-def titled(title: str, values: Mapping[str, float]) -> str:
-    """A table below others; nothing if it is empty (name -> number)."""
-    return f"\n\n[{title}]\n{rows(values)}" if values else ""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml(name)

@@ -25,12 +25,10 @@ _NAMES = {  # module: its public names, loaded when they are first used
     # for plans, for simulations, and the map of what a robot can do
     "jumps": """joint_trajectories inertia_and_momentum margins active ground_reaction jump_strobe
         momentum""",
-    "maps": "envelope_map margin_chart",
-    # the jump in 3-D, the page of a certificate, tables
+    "maps": "envelope_map",
+    # the jump in 3-D, tables
     "viewer": "Page page",
     "movies": "Movie movie",
-    "certificate": "certificate_page",
-    "library": "clips_page draw_film draw_strip",
     "tables": "Table table versions",
     "cards": "card clip_sheet price_bars Plots",
     # helpers: bodies, with the sheet of a robot; curves, colours and saving

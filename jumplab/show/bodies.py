@@ -23,7 +23,8 @@ from jumplab.errors import InputError, quoted
 from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.sagittal import rotated
 from jumplab.robot.stance import stance_angles, stance_configuration
-from jumplab.show.shapes import placed, rounded_body
+from jumplab.robot_import.urdf import placed
+from jumplab.show.shapes import rounded_body
 from jumplab.show.style import (
     FLIGHT,
     GROUND,
@@ -85,7 +86,7 @@ class Silhouette:
         pin.forwardKinematics(self._model, self._data, q)
         outlines = []
         for part, kind in self._parts:
-            flat = placed(part.points, self._data.oMi[part.joint])[:, self._axes]
+            flat = placed(self._data.oMi[part.joint], part.points)[:, self._axes]
             outlines.append((kind, flat[ConvexHull(flat).vertices]))
         return outlines
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -13,6 +11,7 @@ from matplotlib.figure import Figure
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError, Shown
+from jumplab.forms import filled
 from jumplab.show.bodies import robot_sheet
 from jumplab.show.jumps import (
     active,
@@ -21,7 +20,7 @@ from jumplab.show.jumps import (
     jump_strobe,
     margins,
 )
-from jumplab.show.maps import envelope_map, margin_chart
+from jumplab.show.maps import envelope_map
 from jumplab.show.style import (
     COLUMN_IN,
     FLIGHT,
@@ -46,7 +45,6 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.stages import Planner
     from jumplab.studies.envelope import Envelope
     from jumplab.studies.improve import Improved
-    from jumplab.studies.margins import MarginReport
     from jumplab.studies.mend import Mended
     from jumplab.studies.prices import Prices
     from jumplab.studies.record import Record
@@ -63,13 +61,9 @@ def card(x: Shown) -> str | None:
     make = next((CARDS[kind.__name__] for kind in type(x).__mro__ if kind.__name__ in CARDS), None)
     if make is None:
         return None
-    rows, figure = make(x)
-    picture = ""
-    if figure is not None:
-        png = base64.b64encode(figure.png()).decode()
-        picture = f'<img src="data:image/png;base64,{png}" style="max-width: 100%">'
-    title = html.escape(f"{type(x).__name__}: {x.line()}")
-    return f"<div><b>{title}</b>{rows._repr_html_()}{picture}</div>"
+    rows, picture = make(x)
+    title = f"{type(x).__name__}: {x.line()}"
+    return filled("show/card.html", title=title, rows=rows, picture=picture)
 
 
 def _listed(values: Mapping[str, Any], heading: str = "value") -> Table:
@@ -233,10 +227,6 @@ def _scatter(report: TrialReport) -> Figure | None:
     return fig
 
 
-def _of_margins(report: MarginReport) -> Card:
-    return table([margin.row() for margin in report.margins], digits=3), margin_chart(report)
-
-
 def _of_envelope(envelope: Envelope) -> Card:
     rows = []
     for word in ("highest", "farthest"):
@@ -271,7 +261,7 @@ def _of_rows(rows: Rows) -> Card:
     return table([x if isinstance(x, Mapping) else vars(x) for x in rows]), None
 
 
-CARDS: Mapping[str, Callable[[Any], Card]] = {
+CARDS: dict[str, Callable[[Any], Card]] = {
     "Envelope": _of_envelope,
     "Metrics": _of_metrics,
     "JumpTask": _of_task,
@@ -287,7 +277,6 @@ CARDS: Mapping[str, Callable[[Any], Card]] = {
     "Prices": _of_prices,
     "Improved": _of_improved,
     "TrialReport": _of_trials,
-    "MarginReport": _of_margins,
 }
 
 

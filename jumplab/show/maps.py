@@ -1,10 +1,9 @@
-"""Pictures of many jumps: the map of those that a robot can do, the disturbances it tolerates."""
+"""Picture of many jumps: the map of those that a robot can do."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -12,22 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from jumplab.errors import InputError, quoted
 from jumplab.show.style import (
     COLUMN_IN,
-    FLIGHT,
-    INK,
-    LANDING,
-    LAUNCH,
     PAGE_IN,
     new_figure,
     themed,
     tint,
 )
 from jumplab.studies.envelope import BEYOND, OPEN, Envelope
-
-if TYPE_CHECKING:  # pictures need no simulator
-    from jumplab.studies.margins import MarginReport
 
 REFUSED = {
     OPEN: ("#9A9A9A", "no plan found"),
@@ -41,7 +32,6 @@ AXIS_WORDS = {
     "side_m": "to the left [m]",
     "yaw_rad": "turn [rad]",
 }
-MARKS = (LAUNCH, "o"), (FLIGHT, "s"), (INK, "^"), (LANDING, "D")  # of several reports
 
 
 @themed
@@ -103,44 +93,3 @@ def _draw_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: s
         ax.set_xticks(envelope.distances, map(tick.format, envelope.distances))
         ax.set_yticks(envelope.heights, map(tick.format, envelope.heights))
     ax.grid(False)
-
-
-@themed
-def margin_chart(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
-    """The largest size of each disturbance that plans tolerate, as a share of the largest tried:
-    plain, and with re-aim; one mark per report.
-
-    Of several reports, by the names that the legend shall have, only the disturbances that two or
-    more of them have. Raises :class:`InputError` for more reports than marks, or if nothing is left
-    to show.
-    """
-    several = dict(reports) if isinstance(reports, Mapping) else {"": reports}
-    for report in several.values():
-        if not hasattr(report, "margins"):
-            raise InputError(f"the chart shows reports of margins, got {quoted(report)}")
-    counts = Counter(m.names for report in several.values() for m in report.margins if m.reaim)
-    names = [name for name, count in counts.items() if count > 1 or len(several) == 1]
-    if not names or len(several) > len(MARKS):
-        given = f"{len(several)} reports with {len(names)} disturbances in two of them"
-        most = f"up to {len(MARKS)} reports with disturbances in two of them"
-        raise InputError(f"the chart shows {most}, got {given}")
-    fig = new_figure(PAGE_IN, 0.9 + 0.3 * len(names))
-    panels = fig.subplots(1, 2, sharey=True)
-    rows = np.arange(len(names))[::-1]
-    apart = 0.7 * (np.arange(len(several)) / max(len(several), 2) - 0.5)
-    for ax, reaim in zip(panels, (False, True), strict=True):
-        for k, (title, report) in enumerate(several.items()):
-            shares = {m.names: 100 * m.share for m in report.margins if m.reaim == reaim}
-            values = np.array([shares.get(name, np.nan) for name in names])
-            color, marker = MARKS[k]
-            ax.hlines(rows - apart[k], 0, values, color=tint(color, 0.5), linewidth=1.0)
-            look = dict(color=color, marker=marker, linestyle="none", markersize=4, label=title)
-            ax.plot(values, rows - apart[k], clip_on=False, zorder=3, **look)
-        ax.set_title("re-aimed" if reaim else "plain")
-        ax.set(xlim=(0, 100), xlabel="share of the largest size tried [%]")
-        ax.set_yticks(rows, names)
-        ax.grid(False, axis="y")
-    if "" not in several:
-        handles, labels = ax.get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=len(several))
-    return fig

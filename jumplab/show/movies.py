@@ -6,7 +6,6 @@ display.
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from scipy.ndimage import uniform_filter1d
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.forms import filled
 from jumplab.io.files import settle, write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.io.progress import tell
@@ -82,11 +82,12 @@ class Movie:
         return write_file(path, self.data)
 
     def _repr_html_(self) -> str:
-        source = f"data:{KINDS[self.kind][0]};base64,{base64.b64encode(self.data).decode()}"
-        look = f'src="{source}" style="max-width: 100%"'
-        if self.kind == "gif":
-            return f'<img {look} alt="the jump">'
-        return f"<video {look} controls loop autoplay muted playsinline></video>"
+        return filled(
+            "show/movie.html",
+            kind=self.kind,
+            type=KINDS[self.kind][0],
+            data=self.data,
+        )
 
 
 def movie(

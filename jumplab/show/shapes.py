@@ -12,10 +12,10 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import coal
 import numpy as np
 import pinocchio as pin
 from scipy.ndimage import uniform_filter1d
-from scipy.spatial import ConvexHull
 
 from jumplab.control.kinematics import Gauge
 from jumplab.errors import RobotError
@@ -24,6 +24,7 @@ from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet
 from jumplab.robot.files import LEG, SHIPPED
 from jumplab.robot_import.checkup import examine
+from jumplab.robot_import.urdf import placed
 from jumplab.show.style import PHASE_COLORS, tint
 from jumplab.sim.scene import Scene
 
@@ -70,11 +71,6 @@ def parts_of(robot: Robot) -> tuple[list[Part], list[str]]:
     """The parts of a robot, and what there is to say of where they come from."""
     meshes, notes = _published(robot)
     return meshes or rounded_body(robot), notes
-
-
-def placed(points: np.ndarray, place: pin.SE3) -> np.ndarray:
-    """Points (n, 3) of a frame as they are seen from where its ``place`` is [m]."""
-    return points @ place.rotation.T + place.translation
 
 
 class Trace(NamedTuple):
@@ -153,7 +149,7 @@ def _published(robot: Robot) -> tuple[list[Part], list[str]]:
         place = like.lumped.place(link)
         joint = robot.model.frames[robot.model.getFrameId(body, pin.FrameType.BODY)].parentJoint
         for points, triangles in like.tree.meshes(link):
-            parts.append(Part(joint, _kind(robot, joint), placed(points, place), triangles, True))
+            parts.append(Part(joint, _kind(robot, joint), placed(place, points), triangles, True))
     if not parts:
         return [], ["drawn from boxes: its meshes are missing"]
     cell = CELL_M
@@ -196,11 +192,11 @@ class _Box(NamedTuple):
         radius = share * 2 * self.half.min()
         inner = zip(radius - self.half, self.half - radius, strict=True)
         corners = np.array(list(itertools.product(*inner)))
-        return placed((corners[:, None] + radius * BALL).reshape(-1, 3), self.place)
+        return placed(self.place, (corners[:, None] + radius * BALL).reshape(-1, 3))
 
     def inside(self, share: np.ndarray) -> np.ndarray:
         """Points (n, 3) given in half sizes of the box."""
-        return placed(share * self.half, self.place)
+        return placed(self.place, share * self.half)
 
 
 def _boxes(robot: Robot) -> list[_Box]:
@@ -315,10 +311,9 @@ def _discs(robot: Robot) -> Iterator[Part]:
 
 def _hull(joint: int, kind: str, points: np.ndarray) -> Part:
     """The convex hull of points (n, 3), its triangles seen from outside."""
-    hull = ConvexHull(points)
-    corners = points[hull.simplices]
-    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    back = np.einsum("ij,ij->i", outwards, hull.equations[:, :3]) < 0
-    faces = np.where(back[:, None], hull.simplices[:, ::-1], hull.simplices)
-    kept, rows = np.unique(faces, return_inverse=True)
-    return Part(joint, kind, points[kept], rows.reshape(faces.shape))
+    corners = coal.StdVec_Vec3s()
+    corners.extend(points)
+    hull = coal.ConvexBase.convexHull(corners, True, "Qt")
+    faces = map(hull.polygons, range(hull.num_polygons))
+    triangles = [[face[k] for k in range(3)] for face in faces]
+    return Part(joint, kind, np.array(hull.points()), np.array(triangles))

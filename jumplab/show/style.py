@@ -7,8 +7,6 @@ closed.
 
 from __future__ import annotations
 
-import base64
-import html
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -28,6 +26,7 @@ from matplotlib.lines import Line2D
 
 from jumplab.arguments import shaped
 from jumplab.errors import InputError, quoted
+from jumplab.forms import filled
 from jumplab.io.folder import versions, write_file
 from jumplab.robot import Robot
 from jumplab.show.waiting import show_waiting
@@ -121,10 +120,7 @@ class Picture(Figure):
     def _repr_html_(self) -> str | None:
         if not self.caption:
             return None
-        words = html.escape(self.caption)
-        source = f"data:image/png;base64,{base64.b64encode(self.png()).decode()}"
-        image = f'<img src="{source}" alt="{words}" style="max-width: 100%">'
-        return f'<figure style="margin: 0">{image}<figcaption>{words}</figcaption></figure>'
+        return filled("show/picture.html", png=self.png(), caption=self.caption)
 
 
 def file_of(fig: Figure, kind: str, **how: Any) -> bytes:
@@ -291,14 +287,9 @@ def made_with() -> str:
 
 def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -> str:
     """Text of NAME.txt: caption, target (or targets), robot and versions, one line each."""
-    lines = [caption.strip() or "No caption."]
-    tasks = [task] if isinstance(task, JumpTask) else list(task or ())
-    if tasks:
-        words = "; ".join(map(describe_task, tasks))
-        lines.append(f"Target{'s' if len(tasks) > 1 else ''}: {words}.")
-    if robot is not None:
-        lines.append(f"Robot: {robot.name}, {robot.total_mass:.1f} kg, description {robot.hash}.")
-    return "\n".join([*lines, f"Made with {made_with()}.", ""])
+    tasks = [task] if isinstance(task, JumpTask) else task or ()
+    facts = {"robot": robot, "made_with": made_with(), "caption": caption.strip()}
+    return filled("show/caption.txt", tasks=[*map(describe_task, tasks)], **facts)
 
 
 def describe_task(task: JumpTask) -> str:

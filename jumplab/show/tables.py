@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.forms import filled
 from jumplab.io import folder
 
 MOST_ROWS = 12  # of a table in a notebook; those below are folded
@@ -37,17 +37,8 @@ class Table:
 
     def _repr_html_(self) -> str:
         sides = ["right" if right else "left" for right in self.right]
-        cells = "".join(f'<td style="text-align:{side}">{{}}</td>' for side in sides)
-        row = f"<tr>{cells}</tr>"
-        head = row.replace("td", "th").format(*map(html.escape, self.columns))
-        lines = [row.format(*map(html.escape, line)) for line in self.rows]
-
-        def part(some: list[str]) -> str:
-            return f"<table><thead>{head}</thead><tbody>{''.join(some)}</tbody></table>"
-
-        rest = lines[MOST_ROWS:]
-        folded = f"<details><summary>{len(rest)} more rows</summary>{part(rest)}</details>"
-        return part(lines[:MOST_ROWS]) + folded * bool(rest)
+        facts = {"columns": self.columns, "rows": self.rows, "most": MOST_ROWS}
+        return filled("show/table.html", sides=sides, **facts)
 
 
 def table(

@@ -7,20 +7,18 @@ This module computes the data; ``player.js`` draws them.
 from __future__ import annotations
 
 import base64
-import html
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from string import Template
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.forms import filled
 from jumplab.io.folder import write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.robot import Robot
@@ -38,7 +36,6 @@ NOTEBOOK_HEIGHT_PX = 640  # height of the frame in a notebook
 # the ground as drawn
 TRACK_HALF_WIDTH_M = 0.8
 TRACK_DEPTH_M = 0.06
-FILES = {"PAGE": "page.html", "STYLE": "page.css", "PLAYER": "player.js"}
 
 
 @checked
@@ -54,23 +51,17 @@ class Page:
         return write_file(path, self.html.encode())
 
     def _repr_html_(self) -> str:
-        source = html.escape(self.html)
-        look = f"width: 100%; height: {NOTEBOOK_HEIGHT_PX}px; border: 1px solid #d5d9e0"
-        return (
-            f'<iframe srcdoc="{source}" sandbox="allow-scripts" title="{html.escape(self.title)}" '
-            f'style="{look}; border-radius: 6px"></iframe><p><small>No picture? Notebooks that one '
-            "has not run oneself must be trusted before they may move; or open the HTML file in "
-            "the result folder.</small></p>"
+        return filled(
+            "show/frame.html",
+            page=self.html,
+            title=self.title,
+            height=NOTEBOOK_HEIGHT_PX,
         )
 
 
-def filled(form: str, title: str, **facts: Any) -> Page:
+def page_of(form: Path, title: str, **facts: Any) -> Page:
     """The page that a template of Jinja (the file ``form``) makes of ``facts``."""
-    text = (resources.files("jumplab.show") / form).read_text(encoding="utf-8")
-    html_ = jinja2.Template(text, autoescape=True).render(
-        title=title, made_with=made_with(), **facts
-    )
-    return Page(html_, title)
+    return Page(filled(form, title=title, made_with=made_with(), **facts), title)
 
 
 def page(
@@ -136,14 +127,16 @@ def page(
 
 def _assemble(title: str, facts: Mapping[str, Any]) -> str:
     """Fill the template; in JSON ``<`` is escaped, so that no text can end the script."""
-    engine = resources.files("meshcat") / "viewer" / "dist" / "main.min.js"
-    files = {name: resources.files("jumplab.show") / file for name, file in FILES.items()}
-    texts = {name: x.read_text("utf-8") for name, x in (files | {"ENGINE": engine}).items()}
-    if "</script" in texts["ENGINE"]:
+    engine = (resources.files("meshcat") / "viewer" / "dist" / "main.min.js").read_text("utf-8")
+    if "</script" in engine:
         raise InputError("this version of meshcat cannot be put into a page; install another one")
     data = json.dumps(facts, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    texts["FACTS"] = data.replace("<", "\\u003c")
-    return Template(texts.pop("PAGE")).substitute(TITLE=html.escape(title), **texts)
+    return filled(
+        "show/page.html",
+        title=title,
+        engine=engine,
+        facts=data.replace("<", "\\u003c"),
+    )
 
 
 def _ground(scene: Scene, span: tuple[float, float]) -> tuple[list[dict[str, Any]], float]:

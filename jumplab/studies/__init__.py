@@ -1,4 +1,4 @@
-"""Many plans or many simulations: trials, margins, certificates, chains, sweeps, maps, atlases.
+"""Many plans or many simulations: trials, chains, sweeps, maps, atlases.
 
 In come a robot, targets and a result folder; out go frozen reports and a log, with which a stopped
 study goes on. A study makes cases, each with a key of all that decides it, and
@@ -12,12 +12,9 @@ __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=[
         "atlas",
-        "certify",
         "chain",
-        "clips",
         "envelope",
         "grid",
-        "margins",
         "record",
         "study",
         "sweep",

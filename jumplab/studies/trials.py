@@ -19,7 +19,6 @@ from typing import Any
 
 import joblib
 import numpy as np
-import pinocchio as pin
 from scipy.stats import binomtest
 
 from jumplab import reading
@@ -30,7 +29,6 @@ from jumplab.errors import Shown, SolverError
 from jumplab.io import folder as store
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.robot.stance import stance_configuration
 from jumplab.sim import (
     CONTACTS,
     DEFAULT_ENGINE,
@@ -191,7 +189,7 @@ class Trial:
     key: TrialKey  # what it was
     # every drawn number, as :meth:`jumplab.sim.Perturbation.to_json` gives them
     perturbation: Plain
-    features: dict[str, float]  # the drawn robot in a few numbers, see :func:`features`
+    features: dict[str, float]  # the case in a few numbers, where a study gives them
     landed: bool  # the verdict; a run that fails one of its checks has not landed
     reason: str  # and why
     metrics: Metrics | None  # all numbers of the jump; None if the engine lost the robot
@@ -233,7 +231,7 @@ def run_trial(
     """
     drawn = drawn or settings.draw(plan.robot, key.robot_seed)
     play = partial(settings.simulate, plan, drawn, disturbance=disturbance)
-    return Trial(key, drawn.to_json(), features(drawn, plan.robot), *judged(play))
+    return Trial(key, drawn.to_json(), {}, *judged(play))
 
 
 def judged(
@@ -255,28 +253,6 @@ def judged(
     doubts = "; ".join(failed) or "nothing was checked"
     reason = f"failed checks of the run: {doubts}; the run's own verdict: {result.reason}"
     return False, reason, result.metrics, ()
-
-
-def features(drawn: Perturbation, robot: Robot) -> dict[str, float]:
-    """A perturbed robot in a few numbers, all relative to the planned one.
-
-    friction [1], delay_s [s], mass [1] (whole robot), com_x_m and com_y_m [m] (whole robot, in its
-    stance), leg_motors [1] (mean gain of hip, knee and ankle pitch motors, minus 1).
-    """
-    q = stance_configuration(robot)
-    real = drawn.robot(robot)
-    here, planned = (
-        pin.centerOfMass(r.model, r.model.createData(), q, False).copy() for r in (real, robot)
-    )
-    legs = [name for role in ("hip_pitch", "knee", "ankle_pitch") for name in robot.joints[role]]
-    return {
-        "friction": drawn.friction,
-        "delay_s": drawn.delay_s,
-        "mass": real.total_mass / robot.total_mass - 1,
-        "com_x_m": float(here[0] - planned[0]),
-        "com_y_m": float(here[1] - planned[1]),
-        "leg_motors": float(np.mean([drawn.motor_gain.get(name, 1.0) for name in legs])) - 1,
-    }
 
 
 # a series of trials

@@ -1,1 +1,1 @@
-"""Code that only the reproduction of the paper needs: its forms as printed, its claims, and one-off figures."""
+"""Code of the notebooks and of commands that plan nothing: their runner, forms as printed, claims, studies, figures."""

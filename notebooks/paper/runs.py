@@ -10,13 +10,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import joblib
+import numpy as np
+import pinocchio as pin
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim import ENGINES, SimulationResult, simulate_jump
+from jumplab.robot.stance import stance_configuration
+from jumplab.sim import ENGINES, Perturbation, SimulationResult, simulate_jump
 from jumplab.sim.result import STAND_S
 from jumplab.studies.study import in_parallel
-from jumplab.studies.trials import Trial, TrialSettings, run_trials, wilson
+from jumplab.studies.trials import PlanOnFile, Trial, TrialSettings, run_trials, wilson
 from jumplab.task import JumpTask
 from paper import logs
 from paper.basin import landing_basin
@@ -79,11 +82,36 @@ def study(folder: str | Path, path: Path = LOG) -> None:
     Trials in the folder's log are not simulated again. ``python -m paper.runs DIR`` calls it.
     """
     rows = []
+    robot = PlanOnFile.read(folder).robot
     for engine in ENGINES:
         settings = TrialSettings(engine=engine)
-        done = *run_trials(folder, ROBOTS, settings=settings).trials, *landing_basin(folder, None, settings).trials
-        rows += [row(engine, trial) for trial in done]
+        for trial in run_trials(folder, ROBOTS, settings=settings).trials:
+            drawn = settings.draw(robot, trial.key.robot_seed)
+            rows.append(row(engine, replace(trial, features=features(drawn, robot))))
+        rows += [row(engine, trial) for trial in landing_basin(folder, None, settings).trials]
     logs.write(path, rows, folder=folder)
+
+
+def features(drawn: Perturbation, robot: Robot) -> dict[str, float]:
+    """A perturbed robot in a few numbers, all relative to the planned one.
+
+    friction [1], delay_s [s], mass [1] (whole robot), com_x_m and com_y_m [m] (whole robot, in its
+    stance), leg_motors [1] (mean gain of hip, knee and ankle pitch motors, minus 1).
+    """
+    q = stance_configuration(robot)
+    real = drawn.robot(robot)
+    here, planned = (
+        pin.centerOfMass(r.model, r.model.createData(), q, False).copy() for r in (real, robot)
+    )
+    legs = [name for role in ("hip_pitch", "knee", "ankle_pitch") for name in robot.joints[role]]
+    return {
+        "friction": drawn.friction,
+        "delay_s": drawn.delay_s,
+        "mass": real.total_mass / robot.total_mass - 1,
+        "com_x_m": float(here[0] - planned[0]),
+        "com_y_m": float(here[1] - planned[1]),
+        "leg_motors": float(np.mean([drawn.motor_gain.get(name, 1.0) for name in legs])) - 1,
+    }
 
 
 def row(engine: str, trial: Trial) -> dict[str, Any]:

@@ -23,10 +23,10 @@ from jumplab.errors import SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, STEP_S, Perturbation, Ranges, Scene, SimulationResult, simulate_jump
-from jumplab.studies.margins import MarginReport, ranges_at
 from jumplab.studies.study import in_parallel
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 from paper import logs, runs
+from paper.margins import MarginReport, ranges_at
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
 FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), 200, 11

@@ -30,16 +30,17 @@ from jumplab.io.motion import Motion
 from jumplab.robot import SHIPPED, Robot
 from jumplab.robot.files import files_of
 from jumplab.robot.legs import segments_m
+from jumplab.show.viewer import Page
 from jumplab.sim import DEFAULT_ENGINE, ENGINES, Scene, SimulationResult, simulate_jump
 from jumplab.sim.engine import engine_class
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner, here
 from jumplab.stages.whole_body import Contacts
-from jumplab.studies.certify import ModeReport
 from jumplab.studies.study import Plain, in_parallel, key_of
 from jumplab.studies.sweep import VARIED
 from jumplab.studies.trials import Trial, judged
 from jumplab.task import JumpTask
+from paper.certify import ModeReport
 
 SCHEMA = "jumplab-clips-2"
 INDEX = "index.json"
@@ -170,7 +171,7 @@ def make_clips(
     only: Sequence[str] | None = None,
     vary: Sequence[Mapping[str, float]] = (),
     draw: Callable[[Path, Robot, Motion, Scene], str] | None = None,
-    page: Callable[[Plain], str] | None = None,
+    page: Callable[[Plain], Page] | None = None,
     jobs: int | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, list[Plain]]:
@@ -190,7 +191,7 @@ def make_clips(
     vary : of each target further clips, with factors [1] on its "distance" or "height", or on
         "mass", "effort" or "speed" of the robot; on the same side of the split as the target.
     draw : draws a picture of a clip into its folder, and returns the name of the file.
-    page : makes the text of ``index.html`` of the index.
+    page : makes ``index.html`` of the index.
     jobs : processes, by default one per core.
     say : is called with a line per clip.
 
@@ -225,7 +226,7 @@ def make_clips(
                 store.write_file(out / LICENCE, _licence(robot).encode())
                 store.write_file(out / INDEX, store.to_json(head | library).encode())
                 if page:
-                    store.write_file(out / PAGE, page(head | library).encode())
+                    store.write_file(out / PAGE, page(head | library).html.encode())
                 words = "passed" if row["passed"] else f"left out, {row['reasons'][0]}"
                 say(f"{row['name']}: {words}")
         finally:
@@ -259,7 +260,7 @@ def _clip(
     robot = planner.robot
     folder = reading.below(out, told["name"])
     target = task.numbers if isinstance(task, JumpTask) else asdict(task)
-    key = key_of("clip", robot.hash, target)
+    key = key_of("clip", SCHEMA, MODES, robot.hash, target)
     row = store.read_json(folder / ROW) if (folder / ROW).is_file() else {}
     if row.get("key") != key or (again and not row.get("passed")):
         head = {"target": target, "robot": robot.hash, "key": key}

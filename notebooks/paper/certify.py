@@ -13,7 +13,7 @@ plan will be played. The limits are the same in every mode.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -28,6 +28,9 @@ from jumplab.control.servo import servo_of
 from jumplab.errors import InputError, quoted
 from jumplab.io import folder as store
 from jumplab.robot import Robot
+from jumplab.show.style import LANDING, VERMILION, describe_task
+from jumplab.show.tables import table
+from jumplab.show.viewer import Page, page_of
 from jumplab.sim import ENGINES, Perturbation, SensorNoise
 from jumplab.sim.engine import engine_class
 from jumplab.studies.study import Plain, Task, check_numbers, short_hash
@@ -274,7 +277,6 @@ def certify(
     seed: int = 0,
     *,
     modes: Sequence[str] = MODES,
-    page: Callable[[Certificate], str] | None = None,
     jobs: int | None = None,
     progress: bool | None = None,
 ) -> Certificate:
@@ -287,8 +289,6 @@ def certify(
         are kept in ``trials.jsonl``: a stopped run resumes from there.
     modes : of playback ("position", "pd", "whole-body") in each of which the engines have to agree;
         the first one is also played on usual contacts.
-    page : makes the text of ``certificate.html``, written with ``certificate.json``, if there is to
-        be one.
 
     Raises
     ------
@@ -322,6 +322,17 @@ def certify(
         usual = {engine: study.results(softly(engine))[0] for engine in ENGINES}
     where = task, plan.robot, plan.hash, seed, study.resumed
     certificate = Certificate(report, tuple(reports), usual, *where)
-    pages = {PAGE: page(certificate)} if page else {}
-    plan.write(NAME, certificate.to_json(), pages)
+    plan.write(NAME, certificate.to_json(), {PAGE: certificate_page(certificate).html})
     return certificate
+
+
+def certificate_page(certificate: Certificate) -> Page:
+    """A page without scripts of how far the engines are apart, by ``certify.html``."""
+    return page_of(
+        Path(__file__).with_suffix(".html"),
+        f"Certificate: {describe_task(certificate.task)}",
+        certificate=certificate,
+        conditions=CONDITIONS,
+        color=LANDING if certificate.passed else VERMILION,
+        tables=[table(x.differences, COLUMNS, digits=3)._repr_html_() for x in certificate.modes],
+    )

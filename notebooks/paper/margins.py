@@ -5,18 +5,23 @@ least 95 % of the robots land.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
 
 import joblib
+import numpy as np
+from matplotlib.figure import Figure
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError, Shown, quoted
 from jumplab.io import folder as store
 from jumplab.io.progress import tell
+from jumplab.show import cards, tables
+from jumplab.show.style import FLIGHT, INK, LANDING, LAUNCH, PAGE_IN, new_figure, themed, tint
 from jumplab.sim import Ranges, is_pair
 from jumplab.studies.study import Plain, check_numbers
 from jumplab.studies.trials import PlanOnFile, TrialSettings, wilson
@@ -29,6 +34,7 @@ STEPS = 4  # of the bisection: to a sixteenth of the largest size
 # of each disturbance, in the unit of its name; friction falls
 LIMITS = {f.name: f.metadata["least" if f.name == "friction" else "most"] for f in fields(Ranges)}
 SINGLE = tuple(LIMITS)
+MARKS = (LAUNCH, "o"), (FLIGHT, "s"), (INK, "^"), (LANDING, "D")  # of several reports
 PAIRS = ("payload_kg+friction", "ground_m+ground_tilt_deg", "shove_flight_n_s+delay_s")
 
 
@@ -208,3 +214,53 @@ def _largest(probe: Callable[[float], Probe], n: int, steps: int) -> tuple[Probe
         else:
             high = probes[-1][0]
     return best, probes
+
+
+# the chart ------------------------------------------------------------------------------------
+@checked
+@themed
+def margin_chart(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
+    """The largest size of each disturbance that plans tolerate, as a share of the largest tried:
+    plain, and with re-aim; one mark per report.
+
+    Of several reports, by the names that the legend shall have, only the disturbances that two or
+    more of them have. Raises :class:`InputError` for more reports than marks, or if nothing is left
+    to show.
+    """
+    several = dict(reports) if isinstance(reports, Mapping) else {"": reports}
+    for report in several.values():
+        if not hasattr(report, "margins"):
+            raise InputError(f"the chart shows reports of margins, got {quoted(report)}")
+    counts = Counter(m.names for report in several.values() for m in report.margins if m.reaim)
+    names = [name for name, count in counts.items() if count > 1 or len(several) == 1]
+    if not names or len(several) > len(MARKS):
+        given = f"{len(several)} reports with {len(names)} disturbances in two of them"
+        most = f"up to {len(MARKS)} reports with disturbances in two of them"
+        raise InputError(f"the chart shows {most}, got {given}")
+    fig = new_figure(PAGE_IN, 0.9 + 0.3 * len(names))
+    panels = fig.subplots(1, 2, sharey=True)
+    rows = np.arange(len(names))[::-1]
+    apart = 0.7 * (np.arange(len(several)) / max(len(several), 2) - 0.5)
+    for ax, reaim in zip(panels, (False, True), strict=True):
+        for k, (title, report) in enumerate(several.items()):
+            shares = {m.names: 100 * m.share for m in report.margins if m.reaim == reaim}
+            values = np.array([shares.get(name, np.nan) for name in names])
+            color, marker = MARKS[k]
+            ax.hlines(rows - apart[k], 0, values, color=tint(color, 0.5), linewidth=1.0)
+            look = dict(color=color, marker=marker, linestyle="none", markersize=4, label=title)
+            ax.plot(values, rows - apart[k], clip_on=False, zorder=3, **look)
+        ax.set_title("re-aimed" if reaim else "plain")
+        ax.set(xlim=(0, 100), xlabel="share of the largest size tried [%]")
+        ax.set_yticks(rows, names)
+        ax.grid(False, axis="y")
+    if "" not in several:
+        handles, labels = ax.get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=len(several))
+    return fig
+
+
+def _card(report: MarginReport) -> cards.Card:
+    return tables.table([margin.row() for margin in report.margins], digits=3), margin_chart(report)
+
+
+cards.CARDS["MarginReport"] = _card

@@ -15,7 +15,7 @@ from jumplab.robot import Robot
 from jumplab.show.jumps import jump_strobe
 from jumplab.show.movies import write_movie
 from jumplab.show.style import describe_task, file_of
-from jumplab.show.viewer import Page, filled
+from jumplab.show.viewer import Page, page_of
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
 
@@ -53,8 +53,8 @@ def clips_page(index: Mapping[str, Any]) -> Page:
         raise InputError(f"the index of a library lacks {missing[0]!r}; give its index.json")
     done = [*index["clips"], *index["left_out"]]
     title = f"{len(index['clips'])} clips of {index['robot']['name']}"
-    return filled(
-        "library.html",
+    return page_of(
+        Path(__file__).with_suffix(".html"),
         title,
         index=index,
         kinds=dict.fromkeys(row["kind"] for row in done),
