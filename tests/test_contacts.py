@@ -267,15 +267,3 @@ def test_a_flight_onto_lower_ground_lasts_as_long_as_its_fall(bhr):
         assert down.time_s[1] - level.time_s[1] == pytest.approx(down.guess_s - level.guess_s)
     again = Contacts.drop_jump(bhr, 0.3).phases[6]
     assert (again.time_s, again.guess_s) == (level.time_s, level.guess_s)
-
-
-def test_eased_there_is_less_to_do():
-    robot = Robot.load("bhr")
-    off = Contacts.step_off(robot, 0.3)
-    lower = off.eased(1 / 3)
-    assert [p.up_m for p in lower.places] == pytest.approx([-0.1, -0.1])
-    assert [p.ahead_m for p in lower.places] == [p.ahead_m for p in off.places]  # the edge stays where it is
-    hop = Contacts.hop(robot, 0.3)
-    assert [p.ahead_m for p in hop.eased(2 / 3).places] == pytest.approx([0.2, 0.2])
-    assert hop.eased(1.0) == hop and off.eased(1.0) == off
-    assert lower.phases == off.phases
