@@ -1,5 +1,6 @@
 """Contact schedules: what they say of feet and places, the usual ones, and those that cannot be."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -269,13 +270,14 @@ def test_a_flight_onto_lower_ground_lasts_as_long_as_its_fall(bhr):
     assert (again.time_s, again.guess_s) == (level.time_s, level.guess_s)
 
 
-def test_eased_there_is_less_to_do():
-    robot = Robot.load("bhr")
-    off = Contacts.step_off(robot, 0.3)
-    lower = off.eased(1 / 3)
-    assert [p.up_m for p in lower.places] == pytest.approx([-0.1, -0.1])
-    assert [p.ahead_m for p in lower.places] == [p.ahead_m for p in off.places]  # the edge stays where it is
-    hop = Contacts.hop(robot, 0.3)
-    assert [p.ahead_m for p in hop.eased(2 / 3).places] == pytest.approx([0.2, 0.2])
-    assert hop.eased(1.0) == hop and off.eased(1.0) == off
-    assert lower.phases == off.phases
+def test_a_block_lies_ahead_on_level_ground(bhr):
+    over = Contacts.hurdle(bhr, 0.2)
+    assert letters(over) == LEAP
+    first, last, top = over.over
+    step, sole = STEP_SHARE * leg_length(bhr), bhr.foot.toe - bhr.foot.heel
+    assert top == 0.2 and step < first < last < over.places[-1].ahead_m - sole
+    with pytest.raises(InputError, match="give .from, to, top. of a block"):
+        replace(over, over=(0.5, 0.4, 0.2))
+    lower = tuple(replace(place, up_m=-0.1) for place in over.places[1:])
+    with pytest.raises(InputError, match="a block lies on level ground"):
+        replace(over, places=(*over.places[:1], *lower))

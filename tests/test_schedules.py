@@ -57,6 +57,23 @@ def test_an_edge_lies_across_the_way_ahead():
     assert plan.audit.passed, plan.audit.table()
 
 
+def test_a_hurdle_clears_its_block():
+    """For planner, audit and simulation; a block that is 5 cm higher is hit."""
+    robot = jl.Robot.load("bhr")
+    hurdle = jl.Contacts.hurdle(robot, 0.2)
+    plan = jl.plan(robot=robot, contacts=hurdle)
+    assert plan.audit.passed, plan.audit.table()
+    first, last, top = plan.summary["over"]
+    assert (first, last, top) == hurdle.over and top == 0.2
+    higher = audit(plan.tape, robot, plan.task, over=(first, last, top + 0.05))
+    assert [check.name for check in higher.failed] == ["body clearance"]
+    assert "block" in higher["body clearance"].note
+    scene = jl.Scene.of_plan(plan.summary, robot)
+    toes = robot.foot.toe - float(robot.foot.center[0])
+    assert scene.top_at(toes + (first + last) / 2) == 0.2
+    assert scene.top_at(toes + first - 0.01) == scene.top_at(toes + last + 0.01) == 0
+
+
 def test_its_attempts_say_what_was_tried():
     plan = hop()
     assert plan.attempts[0].start == "schedule" and plan.attempts[-1].status.startswith("Solve")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from jumplab.arguments import checked
@@ -36,7 +36,12 @@ GROUPS = (
 
 @checked
 def audit(
-    tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: float | None = None
+    tape: Tape,
+    robot: Robot,
+    task: JumpTask | None = None,
+    *,
+    edge_m: float | None = None,
+    over: Sequence[float] | None = None,
 ) -> AuditReport:
     """Audit a finished plan with nothing but its tape and the robot's URDF.
 
@@ -52,12 +57,13 @@ def audit(
         is 9.8, and the landing surface is where the soles are at the end.
     edge_m : where the landing surface of another height begins, ahead of the toes' first place [m];
         by default 5 cm behind the landing soles if it is higher, 5 cm ahead of the toes if lower.
+    over : (from, to, top) of a block that no link may touch, ahead of that place too [m].
     """
     open_tape(tape, robot, task)
     checks = _checks(motion.form(tape))
     capture = []
     if all(c.passed for c in checks):
-        r = replay(tape, robot, task, edge_m)
+        r = replay(tape, robot, task, edge_m, over)
         limits = of_size(robot)[1]
         checks += _checks((measure for group in GROUPS for measure in group(r)), limits)
         capture = _checks(motion.capture(r))
@@ -83,7 +89,8 @@ def write_audit(folder: str | Path) -> AuditReport:
     tell("audit")
     tape, robot, summary = read_plan(folder)
     task = JumpTask.of(summary["target"])
-    report = audit(tape, robot, task, edge_m=summary.get("platform_edge_m"))
+    ground = {"edge_m": summary.get("platform_edge_m"), "over": summary.get("over")}
+    report = audit(tape, robot, task, **ground)
     manifest = {**report.manifest, "plan_sha256": sha256(Path(folder, PLAN)), "planner": summary}
     report = dataclasses.replace(report, manifest=manifest)
     with transaction(folder) as staging:

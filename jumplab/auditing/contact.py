@@ -12,6 +12,8 @@ import pinocchio as pin
 from jumplab.auditing.replay import Replay, norm
 from jumplab.auditing.report import LIMITS, METHOD, Measure
 
+OVER = "block"  # that the robot goes over
+
 
 def places(r: Replay) -> Iterator[Measure]:
     """Places of the soles: slip, turn, heights over ground and platform."""
@@ -93,8 +95,13 @@ def collisions(r: Replay) -> Iterator[Measure]:
         r.model.frames[r.model.getFrameId(str(n), pin.FrameType.BODY)].parentJoint
         for n in r.tape.contact_frames
     }
-    blocks = [geometry.addGeometryObject(block) for block in _surroundings(r)]
-    outer = [(i, block) for block, (i, a) in product(blocks, shapes) if a not in feet]
+    blocks = [(geometry.addGeometryObject(x), x.name) for x in _surroundings(r)]
+    # feet stand on all but what they go over
+    outer = [
+        (i, block)
+        for (block, name), (i, a) in product(blocks, shapes)
+        if a not in feet or name == OVER
+    ]
     for pair in inner + outer:
         geometry.addCollisionPair(pin.CollisionPair(*pair))
     rows = np.unique([*range(0, len(r.tape.t), METHOD.collision_step), len(r.tape.t) - 1])
@@ -112,7 +119,9 @@ def collisions(r: Replay) -> Iterator[Measure]:
 
 
 def _surroundings(r: Replay) -> Iterator[pin.GeometryObject]:
-    """The lower surface as a half space, the higher one, if there is one, as a block."""
+    """The lower surface as a half space, the higher one, if there is one, as a block, and a block
+    that the robot goes over.
+    """
     low, high = sorted((0.0, r.platform))
     below = coal.Halfspace(np.array([0.0, 0.0, 1.0]), low)
     yield pin.GeometryObject("ground", 0, 0, pin.SE3.Identity(), below)
@@ -123,3 +132,8 @@ def _surroundings(r: Replay) -> Iterator[pin.GeometryObject]:
         centre = turn @ np.array([r.edge + towards * size / 2, 0.0, high - size / 2])
         block = coal.Box(size, size, size)
         yield pin.GeometryObject("platform", 0, 0, pin.SE3(turn, centre), block)
+    if r.over:
+        first, last, top = r.over
+        block = coal.Box(last - first, METHOD.block_m, top)
+        centre = np.array([r.toes + (first + last) / 2, 0.0, top / 2])
+        yield pin.GeometryObject(OVER, 0, 0, pin.SE3(np.eye(3), centre), block)

@@ -53,6 +53,7 @@ class Replay:
     robot: Robot
     task: JumpTask | None
     edge_m: float | None
+    over: Sequence[float] | None
     model: pin.Model  # built from the URDF alone, as the geometry
     geometry: pin.GeometryModel
     soles: tuple[Sole, ...]  # one per contact frame
@@ -176,6 +177,13 @@ class Replay:
         first, last = self.toe_corners[[0, -1], ..., 0].mean(axis=(1, 2))
         return 1.0 if self.course_rad or last >= first else -1.0
 
+    @property
+    def toes(self) -> float:
+        """First place of the toes along the axis on which the surfaces change [m]."""
+        foot = self.robot.foot
+        middle = float(self.along(self.sole_points[0]).mean())
+        return middle + foot.toe - float(foot.center[0])
+
     @cached_property
     def edge(self) -> float:
         """Place of the step between the two surfaces [m], as given; or else where the world is most
@@ -187,8 +195,7 @@ class Replay:
         """
         ahead = self.along(self.sole_points[[0, -1]])
         if self.edge_m is not None:
-            foot = self.robot.foot
-            return float(ahead[0].mean()) + foot.toe - float(foot.center[0]) + self.edge_m
+            return self.toes + self.edge_m
         launched = float((self.heading * ahead[0]).max())
         landed = float((self.heading * ahead[1]).min())
         up = min(max(landed - METHOD.edge_room_m, launched), landed)
@@ -250,7 +257,13 @@ def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Mode
     return model, [model.getFrameId(name, pin.FrameType.BODY) for name in frames]
 
 
-def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None = None) -> Replay:
+def replay(
+    tape: Tape,
+    robot: Robot,
+    task: JumpTask | None,
+    edge_m: float | None = None,
+    over: Sequence[float] | None = None,
+) -> Replay:
     """Recompute motion and forces of a whole tape (finite numbers only; see :func:`open_tape`)."""
     model, frames = open_tape(tape, robot, task)
     try:
@@ -266,7 +279,7 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
     motion["tau"] += motors.armature * tape.a[:, 6:] + lost
     motion["energy"] += (motors.armature * rates**2).sum(axis=1) / 2
     soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
-    return Replay(tape, robot, task, edge_m, model, geometry, soles, lost=lost, **motion)
+    return Replay(tape, robot, task, edge_m, over, model, geometry, soles, lost=lost, **motion)
 
 
 def configured_sole(robot: Robot) -> Sole:

@@ -118,15 +118,19 @@ class Scene:
     @classmethod
     def of_plan(cls, summary: Mapping[str, Any], robot: Robot) -> Scene:
         """The ground that a plan was made for, from its ``summary``: flat, or two levels that meet
-        at the edge.
+        at the edge; with the block that it goes over.
         """
+        toes = robot.foot.toe - float(robot.foot.center[0])  # soles' middle at x = 0
         try:
             top = summary["target"]["platform_m"]
+            if over := summary.get("over"):
+                first, last, height = over
+                block = Block(toes + first, toes + last, height, height)
+                return cls("block", (*cls.flat().blocks, block))
             if top == 0:
                 return cls.flat()
             along_rad = JumpTask.of(summary["target"]).along_rad
-            # soles' middle at x = 0
-            edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])
+            edge = summary["platform_edge_m"] + toes
         except (KeyError, TypeError) as e:
             raise InputError(
                 f"the summary is not that of a plan ({e}); plan the jump again"

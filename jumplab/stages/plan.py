@@ -88,6 +88,7 @@ class JumpPlan(Shown, Named):
         summary = planned(tape) | _summary(robot, method, tape, body, srmp, joints)
         if contacts is not None:
             summary["contacts"] = [p.feet for p in contacts.phases]
+            summary["over"] = contacts.over
             if contacts.aimed:
                 summary["planned_distance_m"] = flown(tape, robot)
         return cls(body.task, robot, method, tape, summary, srmp, joints, body, contacts)
@@ -123,7 +124,8 @@ class JumpPlan(Shown, Named):
         """Its audit, made when it is first asked for; see :func:`jumplab.audit`."""
         from jumplab.auditing import audit
 
-        return audit(self.tape, self.robot, self.task, edge_m=self.summary["platform_edge_m"])
+        ground = {"edge_m": self.summary["platform_edge_m"], "over": self.summary.get("over")}
+        return audit(self.tape, self.robot, self.task, **ground)
 
     @property
     def verdict(self) -> str:

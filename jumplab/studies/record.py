@@ -48,7 +48,7 @@ EASY = {
     "yaw_rad": ((0.3, 0.12), (1.0, 0.3)),
 }
 HALVES = 0.5, 0.25  # of the easiest, where none of them has a plan
-GROWS = 1.5  # times the turn before, from one plan to the next
+GROWS = 1.5  # times the number before, from one plan to the next
 # shares of the best that they led to, whose own plans, of least effort, are the next starts
 CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
@@ -304,10 +304,10 @@ class _Search:
                 # after steps links meet, and a record begins with their rows
                 begin = self.stage.solved if task.standing else self.stage.plan
                 near = begin(task)
-                if self.what == "yaw_rad":
-                    task, near = self.turned(task, near)
+                if self.what == "yaw_rad" or not task.standing:
+                    task, near = self.climbed(task, near)
                 program = self.program(task)
-                solved = program.solve_apart(Asked(task, near=near), SEEKING)
+                solved = self.leapt(program, Asked(task, near=near))
             except (InfeasibleError, SolverError) as e:
                 refusal = e
                 continue
@@ -324,13 +324,22 @@ class _Search:
         self.task = task
         return found, solved
 
-    def turned(self, task: JumpTask, near: Solved) -> tuple[JumpTask, Solved]:
-        """The largest turn that plans lead to, each from the one before, with rows for the links
-        that met on the way: where the largest turn is sought at once, legs pass through each other.
+    def leapt(self, program: Program, asked: Asked) -> Solved:
+        """The largest number from where ``asked`` begins; with a low barrier where a high one,
+        which leaves the start far behind, leads nowhere.
         """
-        largest = RANGES["yaw_rad"][2]
+        with suppress(SolverError):
+            return program.solve_apart(asked, SEEKING)
+        return program.solve_apart(asked, RECORD)
+
+    def climbed(self, task: JumpTask, near: Solved) -> tuple[JumpTask, Solved]:
+        """The largest turn, or flight after steps, that plans lead to, each from the one before,
+        with rows for the links that met on the way: where the largest is sought at once, legs pass
+        through each other.
+        """
+        largest = RANGES[self.what][2]
         with suppress(InfeasibleError, SolverError):
-            while GROWS * task.yaw_rad < largest:
+            while GROWS * getattr(task, self.what) < largest:
                 more = self.at(task, GROWS)
                 program = self.stage.program(more)
                 near = program.solve_apart(Asked(more, near=near), FROM_NEIGHBOUR[0])

@@ -85,7 +85,8 @@ class PlanOnFile:
     def hash(self) -> str:
         """Short hash of all that a trial takes from here: tape, robot, ground."""
         names = self.summary["manifest"]["files"], self.summary["target"]
-        return short_hash([*names, self.summary.get("platform_edge_m")])
+        over = self.summary.get("over") or ()
+        return short_hash([*names, self.summary.get("platform_edge_m"), *over])
 
     def study(self, **options: Any) -> AbstractContextManager[Study]:
         """A study of trials, kept in ``trials.jsonl``; options as of :func:`.study.open_study`."""

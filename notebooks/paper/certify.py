@@ -305,7 +305,8 @@ def certify(
         engine_class(engine)
     plan = PlanOnFile.read(folder)
     task = JumpTask.of(plan.summary["target"])
-    report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
+    ground = {"edge_m": plan.summary["platform_edge_m"], "over": plan.summary.get("over")}
+    report = audit(plan.tape, plan.robot, task, **ground)
     reports = []
     total = ((n + 1) * len(modes) + 1) * len(ENGINES)
     with plan.study(total=total, jobs=jobs, progress=progress) as study:

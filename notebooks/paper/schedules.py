@@ -44,6 +44,7 @@ CASES = {
     "step off 0.3 m": "step_off=0.3",
     "drop jump 0.2 m": "drop_jump=0.2",
     "hurdle": "hurdle",
+    "hurdle over 0.2 m": "hurdle=0.2",
     "five bounds": "bound=5",
     "target 0.5 m after a run-up": jl.JumpTask(0.5, RISE_M, takeoff="left", run_up=2),
 }

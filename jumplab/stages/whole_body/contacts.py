@@ -31,6 +31,9 @@ INTERVALS = {"two feet": 12, "one foot": 12, "toes": 6, FLIGHT: 12}
 STEP_SHARE = 0.33  # of the leg: a step or hop of usual length
 # of a step of usual length, by which the feet of a run-up come down ahead of each other
 LONGER = 0.9
+# of the leg, from the toes to a block ahead of them, and from it to the heels beyond; its length
+BEFORE_BLOCK = 0.3
+BLOCK_M = 0.05
 FREE_SHARE = 0.5  # of it, by which those before a target may be longer or shorter
 
 
@@ -121,6 +124,8 @@ class Contacts:
     first : places of the first contacts, left before right; those of the stance if empty.
     aimed : whether the last flight has the rise of the target, and covers its distance; its places
         count from there, not from where a foot stood first.
+    over : (from, to, top) of a block across the way that every link clears, ahead of the toes'
+        first place [m]; None if there is none.
 
     Raises
     ------
@@ -133,6 +138,7 @@ class Contacts:
     ends: str = "rest"
     first: tuple[Place, ...] = ()
     aimed: bool = False
+    over: tuple[float, float, float] | None = None
     # (phase, side) of each contact, the first ones included
     landings: tuple[tuple[int, int], ...] = field(init=False)
 
@@ -169,6 +175,10 @@ class Contacts:
         names = [p.name for p in phases]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             yield f"two phases are called {twice[0]!r}; names must be unique in a schedule"
+        if self.over and not (self.over[0] < self.over[1] and self.over[2] > 0):
+            yield f"over = {self.over}: give (from, to, top) of a block [m], from < to and top > 0"
+        if self.over and any(p.up_m for p in self.places):
+            yield "over: a block lies on level ground; leave out up_m, or the block"
         if self.ends not in ("rest", "touchdown"):
             yield f"ends = {quoted(self.ends)}: choose 'rest' or 'touchdown'"
         if last.flying != (self.ends == "touchdown"):
@@ -237,14 +247,6 @@ class Contacts:
     def is_aimed(self, contact: int) -> bool:
         """Whether a contact (index into :attr:`landings`) is one that the target places."""
         return self.aimed and self.landings[contact][0] > self.last_flight
-
-    def eased(self, share: float) -> Contacts:
-        """The same with less to do: a ``share`` [1] of its step up or down or, on level ground, of
-        all ways and turns.
-        """
-        less = ("up_m",) if self.surface[0] else ("ahead_m", "left_m", "turn_rad")
-        places = (replace(p, **{x: share * getattr(p, x) for x in less}) for p in self.places)
-        return replace(self, places=tuple(places))
 
     def contact_of(self, phase: int, side: int) -> int:
         """Index into :attr:`landings` of the contact of a foot (0 left, 1 right) in a phase."""
@@ -352,9 +354,20 @@ class Contacts:
         return cls.of(" ".join(words), robot, [Place(d), Place(share * d), Place(share * d)])
 
     @classmethod
-    def hurdle(cls, robot: Robot, step_m: float | None = None) -> Contacts:
-        """A leap that goes farther, ``step_m`` [m] as there."""
-        return cls.leap(robot, step_m, share=2.8)
+    def hurdle(cls, robot: Robot, height_m: float = 0.0, step_m: float | None = None) -> Contacts:
+        """A leap that goes farther, ``step_m`` [m] as there; over a block of ``height_m`` [m] in
+        the middle of it, if that is above 0.
+        """
+        if height_m <= 0:
+            return cls.leap(robot, step_m, share=2.8)
+        d = _step(robot, step_m)
+        gap = BEFORE_BLOCK * leg_length(robot)
+        block = d + gap, d + gap + BLOCK_M, height_m
+        landed = block[1] + gap + robot.foot.toe - robot.foot.heel
+        plain = cls.leap(robot, d, share=landed / d)
+        # the foot that follows goes over the block as the other one stands
+        phases = [replace(p, intervals=18) if len(p.modes) < 2 else p for p in plain.phases[-3:]]
+        return replace(plain, phases=(*plain.phases[:-3], *phases), over=block)
 
     @classmethod
     def bound(cls, robot: Robot, jumps: int = 2, jump_m: float | None = None) -> Contacts:
@@ -385,7 +398,7 @@ NAMED = {
     "hop": ("metres", float, False),
     "run_up": ("steps", int, False),
     "leap": ("metres", float, False),
-    "hurdle": ("metres", float, False),
+    "hurdle": ("metres of height", float, False),
     "bound": ("jumps", int, False),
     "step_off": ("metres", float, True),
     "drop_jump": ("metres", float, True),

@@ -25,12 +25,14 @@ class Surface:
     edge_m : where the edge is, ahead of the world's origin.
     along_rad : the way in which it is ahead.
     room_m : by how much the upper part could reach further before it met a sole.
+    over : (from, to, top) of a block that lies on it, ahead of the world's origin [m].
     """
 
     height_m: float = 0.0
     edge_m: float = 0.0
     along_rad: float = 0.0
     room_m: float = 0.0
+    over: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
     def between(
@@ -47,7 +49,10 @@ class Surface:
 
     def below(self, points: np.ndarray) -> np.ndarray:
         """Height of the ground below points (..., 3) [m]."""
-        return np.where(points[..., :2] @ self.along > self.edge_m, self.height_m, 0.0)
+        ahead = points[..., :2] @ self.along
+        first, last, top = self.over
+        level = np.where(ahead > self.edge_m, self.height_m, 0.0)
+        return np.where((first < ahead) & (ahead < last), top, level)
 
     @property
     def along(self) -> np.ndarray:
@@ -111,10 +116,13 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
         first = aimed.index(True)
         before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
         after = [before[-1] + task.distance_m]
+    toes = float(body.places[:, 0].mean())
+    if contacts.over:
+        first, last, top = contacts.over
+        return Surface(over=(toes + first, toes + last, top))
     if height == 0:
         return Surface()
     length = 2 * body.half_m
-    toes = float(body.places[:, 0].mean())
     leaving = toes + max(before)
     arriving = toes + min(after) - length
     room = 2 * limits.edge_before_heel_m

@@ -34,6 +34,7 @@ from jumplab.stages.whole_body.terms import (
     loads,
     motor_lines,
     opening_rows,
+    over_block,
     reserve,
     rise,
     sides_apart,
@@ -153,7 +154,11 @@ class Schedule:
         """The distance of the target, from the feet that leave last to those that land."""
         flight = self.contacts.last_flight
         left = [(flight - 1, side) for side in self.modes[flight - 1].sides]
-        landed = [(k, x) for k in range(flight + 1, len(self.modes)) for x in self.landed(k)]
+        landed: dict[int, int] = {}
+        for k in range(flight + 1, len(self.modes)):
+            for side in self.landed(k):
+                landed.setdefault(side, k)
+        landed = [(k, side) for side, k in landed.items() if side in self.free.sides]
         return distance_flown(self.body, [p.name for p in self.contacts.phases], left, landed)
 
     def _terms(self, k: int) -> list[Term]:
@@ -170,6 +175,8 @@ class Schedule:
             terms += foot_rows(m, side, not landed, side in landed)
         swinging = [side for side in self.free.sides if side not in m.modes]
         terms += [swing_rows(m, side, self.follows) for side in swinging]
+        if self.contacts.over and len(m.modes) < len(SIDES):
+            terms.append(over_block(m, self.contacts.over))
         if m.flying:
             terms += opening_rows(m)
         if self.tracking:

@@ -183,26 +183,6 @@ def from_straight(program: Program, asked: Asked) -> Beginning:
     return Beginning(ramped(program.contacts, phases, asked.task))
 
 
-def from_eased(program: Program, asked: Asked) -> Beginning:
-    """The schedule, or the target that it has, with less to do (see :meth:`.Contacts.eased`), then
-    with ever more.
-    """
-    start = DRAWN
-    task = asked.task
-    for share in EASED:
-        easy = program
-        if program.contacts.aimed:
-            less = {x: share * getattr(task, x) for x in ("distance_m", "platform_m")}
-            asked = replace(asked, task=replace(task, **less))
-        else:
-            easy = replace(program, contacts=program.contacts.eased(share))
-        named = replace(start, name=f"{100 * share:.0f} % of the schedule")
-        solved = easy.solve_apart(asked, named)
-        asked = replace(asked, near=solved)
-        start = FROM_NEIGHBOUR[0]
-    return from_solved(program, solved)
-
-
 def from_solved(program: Program, solved: Solved) -> Beginning:
     """A solution in the same coordinates, at the nodes (N + 1,) of the program's phases."""
     intervals = {p.name: p.intervals for p in program.contacts.phases}
@@ -275,11 +255,8 @@ ROUGH = {
 }
 # of a schedule, whose feet are in place and whose links meet long before its cost has settled
 DRAWN = replace(COLD[0], patience=100, options=QUICK | ROUGH)
-# shares of a schedule, solved one after the other, each from the one before
-EASED = 1 / 3, 2 / 3
-LESS = Start("eased schedule", from_eased, True, 100, NEAR)
 # one that leads somewhere has done so after 40 steps
-ALONG = (replace(DRAWN, patience=50), LESS, *COLD[1:])
+ALONG = (replace(DRAWN, patience=50), *COLD[1:])
 # where links meet, more of its rows are left to the second solve: from 3e-2 to 1e-2 the barrier of
 # the first one may wander for ten steps
 MET_ROUGHLY = ROUGH | {"acceptable_constr_viol_tol": 3e-2}

@@ -187,6 +187,33 @@ def body_clearance(m: Mode) -> Term:
     return limit(*words, heights, least, skip=(1, 0), **CLEAR)
 
 
+def over_block(m: Mode, over: tuple[float, float, float]) -> Term:
+    """Shanks, knees and soles in the air stay above a block (from, to, top), ahead of the toes'
+    first place [m]; it counts as longer, and higher, since feet move on between the nodes.
+    """
+    body = m.body
+    lim = m.limits
+    first, last, top = over
+    begins = float(body.places[:, 0].mean()) + first - lim.edge_step_m
+    ends = begins + last - first + 2 * lim.edge_step_m
+    face = body.shank_m + lim.clearance_m
+    spots = [(spot, face) for spot in (*body.limb_points[:2], *body.shank_points)]
+    for side in {0, 1} - set(m.modes):
+        toes, heels = np.split(body.corners[side], 2)
+        sole = [toes + share * (heels - toes) for share in SOLE_SHARES[::2]]
+        spots += [((body.feet[side], x), lim.clearance_m) for x in np.concatenate(sole)]
+
+    def inside(x):
+        smooth = 2 * lim.edge_smoothing_m
+        return (ca.tanh((x - begins) / smooth) - ca.tanh((x - ends) / smooth)) / 2
+
+    def heights(p):
+        points = [(p.tree.point(*spot), room) for spot, room in spots]
+        return ca.vertcat(*(x[2] - (top + room) * inside(x[0]) for x, room in points))
+
+    return limit("over the block", "ours", "m", "node", heights, -lim.link_distance_m, **CLEAR)
+
+
 def sides_apart(m: Mode) -> list[Term]:
     """Left and right knees, ankles, toes and heels keep a share of their distance in the stance,
     seen from the trunk; hands stay outside. Cheap rows, which hold for most motions what distances
