@@ -1,9 +1,9 @@
 """Landing controller: a whole-body QP in torque mode, entered at touchdown.
 
 The paper lands with the controller of an earlier paper of its authors (Sec. VI-A) and does not
-repeat it. Here, every 4 ms (2 in flips), joint accelerations and foot wrenches are chosen that obey the base
-dynamics, friction, the soles' edges and the motors' torques, and come closest to a list of wishes:
-CoM, angular momentum, trunk, feet flat and still, posture.
+repeat it. Here, every 4 ms (2 in flips), joint accelerations and foot wrenches are chosen that obey
+the base dynamics, friction, the soles' edges and the motors' torques, and come closest to a list of
+wishes: CoM, angular momentum, trunk, feet flat and still, posture.
 """
 
 from __future__ import annotations

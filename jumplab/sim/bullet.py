@@ -117,20 +117,6 @@ def base_to_bullet(
     return q[:3] + attitude @ lever, q[3:7].copy(), velocity, attitude @ v[3:6]
 
 
-def base_from_bullet(
-    position: np.ndarray,
-    quaternion: np.ndarray,
-    velocity: np.ndarray,
-    rate: np.ndarray,
-    lever: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
-    attitude = rotation(quaternion)
-    twist = np.array([velocity, rate]) @ attitude
-    twist[0] += pin.skew(lever) @ twist[1]
-    return np.concatenate([position - attitude @ lever, quaternion]), twist.ravel()
-
-
 class BulletEngine(Engine):
     """PyBullet behind the interface of :class:`.engine.Engine`."""
 
@@ -195,6 +181,7 @@ class BulletEngine(Engine):
         self._feet = [self.links.index(name) - 1 for name in self.robot.foot.frames]
         lever, tilt = self._bullet.getDynamicsInfo(self._body, -1)[3:5]
         self._lever = np.array(lever)
+        self._arm = pin.skew(self._lever)
         if abs(abs(tilt[3]) - 1) > 1e-9:
             raise RobotError(
                 f"robot {self.robot.name}: the inertial frame of {base} is turned; "
@@ -254,13 +241,17 @@ class BulletEngine(Engine):
         )
 
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
-        pose = self._bullet.getBasePositionAndOrientation(self._body)
+        place, turn = self._bullet.getBasePositionAndOrientation(self._body)
         twist = self._bullet.getBaseVelocity(self._body)
-        base_q, base_v = base_from_bullet(*pose, *twist, self._lever)
-        rows = self._bullet.getJointStates(self._body, self._joints)
-        angles = [row[0] for row in rows]
-        rates = [row[1] for row in rows]
-        return np.concatenate([base_q, angles]), np.concatenate([base_v, rates])
+        angles, rates, *_ = zip(*self._bullet.getJointStates(self._body, self._joints), strict=True)
+        attitude = rotation(turn)
+        q = np.array([*place, *turn, *angles])
+        v = np.array([*twist[0], *twist[1], *rates])
+        # the inverse of :func:`base_to_bullet`
+        q[:3] -= attitude @ self._lever
+        v[:6] = (v[:6].reshape(2, 3) @ attitude).ravel()
+        v[:3] += self._arm @ v[3:6]
+        return q, v
 
     def set_torque(self, tau: np.ndarray) -> None:
         """Torque of every joint for the next step [N m]."""

@@ -19,7 +19,7 @@ from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.robot import Robot
 from jumplab.sim import CONTACTS, DEFAULT_ENGINE, ENGINES, INSTALLED
 from jumplab.sim.perturbation import FRICTION
-from jumplab.sim.scene import Contacts, Scene
+from jumplab.sim.scene import Scene
 
 # by how much an engine's mass, and its friction, may differ from what was asked for
 MASS_KG = 1e-6
@@ -219,14 +219,6 @@ class Engine(ABC):
         origin of the foot link [N, N m].
         """
         return self._wrenches(self._notes[-1:])[0] if self._notes else np.zeros((2, 6))
-
-    def contacts(self) -> Contacts:
-        """Contacts of the last step, and their forces."""
-        if not self._notes:
-            return Contacts(self.wrench(), frozenset(), False)
-        touching, colliding = (x[0] for x in self._touched(self._notes[-1:]))
-        links = frozenset(self.links[k] for k in np.flatnonzero(touching))
-        return Contacts(self.wrench(), links, bool(colliding))
 
     def log(self) -> Log:
         """All steps so far."""
