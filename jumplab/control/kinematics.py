@@ -123,7 +123,12 @@ class Gauge:
 
     def feet(self, q: np.ndarray) -> np.ndarray:
         """Homogeneous transforms (N, 2, 4, 4) of both feet in ``q`` (N, nq) [m]."""
-        return np.array([[foot.homogeneous for foot in self.places(row)] for row in q])
+        joints = np.empty((len(q), 2, 4, 4))
+        for row, there in zip(q, joints, strict=True):
+            pin.forwardKinematics(self.model, self.data, row)
+            for side, foot in enumerate(self._feet):
+                there[side] = self.data.oMi[foot.joint].homogeneous
+        return joints @ np.array([foot.placement.homogeneous for foot in self._feet])
 
     def soles(self, q: np.ndarray) -> np.ndarray:
         """Mean of both soles' middles (3,) in ``q`` (nq,) [m]."""

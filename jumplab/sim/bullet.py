@@ -40,7 +40,8 @@ HARD = Contact({"numSolverIterations": 1000, "contactERP": 0.1, "contactSlop": 1
 # friction combines as a product: the robot's coefficient is the effective one
 GROUND_FRICTION = 1.0
 NOTHING = np.zeros((0, 16))  # what is noted of points on which ground presses, where it does not
-NOWHERE = [(0.0,) * 6 + (1.0,)] * 2  # places and attitudes of the feet, where nothing presses
+# places and attitudes of the feet, where nothing presses
+NOWHERE = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]] * 2)
 FASTEST = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
 
 
@@ -295,26 +296,23 @@ class BulletEngine(Engine):
             if row[2] != self._body
         ]
         self.fallen = any(point[0] not in self._feet for point in points)
-        feet = NOWHERE
-        if points:
-            states = [self._bullet.getLinkState(self._body, foot) for foot in self._feet]
-            feet = [state[4] + state[5] for state in states]
-        self._notes.append((np.array(points) if points else NOTHING, len(points) < len(rows), feet))
+        if not points:
+            self._notes.append((NOTHING, bool(rows), NOWHERE))
+            return
+        states = [self._bullet.getLinkState(self._body, foot) for foot in self._feet]
+        feet = np.array([state[4] + state[5] for state in states])
+        self._notes.append((np.array(points), len(points) < len(rows), feet))
 
-    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
+    def _pressed(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         step, link, arm, force, _ = self._presses(notes)
         wrench = np.zeros((len(notes), 2, 6))
         pushes = np.hstack([force, moments(arm, force)])
         for side, foot in enumerate(self._feet):
             on_it = link == foot
             np.add.at(wrench[:, side], step[on_it], pushes[on_it])
-        return wrench
-
-    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        step, link, *_ = self._presses(notes)
         touching = np.zeros((len(notes), len(self.links)), bool)
         touching[step, link + 1] = True
-        return touching, np.array([note[1] for note in notes])
+        return wrench, touching, np.array([note[1] for note in notes])
 
     def _presses(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, ...]:
         """Of all k points that were noted: step, link, place (k, 3) from the foot, force (k, 3) and

@@ -192,9 +192,8 @@ class MujocoEngine(Engine):
         self._back = np.zeros(4)  # from the world into the base's axes
         # of the contact sensors in a step: all of them, those of the feet, forces on other links
         self._felt = np.zeros((self.contact.substeps, model.nsensordata))
-        columns = 3 + np.arange(9 * len(self.links)).reshape(-1, 3, 3)
-        self._on_feet = columns[self._feet - 1]
-        self._stray = np.delete(columns, self._feet - 1, axis=0)[:, 0].ravel()
+        columns = 3 + np.arange(9 * len(self.links)).reshape(-1, 9)
+        self._stray = np.delete(columns, self._feet - 1, axis=0)[:, :3].ravel()
 
     def close(self) -> None:
         """Free the engine."""
@@ -284,20 +283,17 @@ class MujocoEngine(Engine):
         self.fallen = met is not None and np.count_nonzero(felt[:, self._stray]) > 0
         self._notes.append((felt, origins, met))
 
-    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
+    def _pressed(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Forces are means over a step; moments are about where the feet were before it."""
         felt, origins = (np.array([note[k] for note in notes]) for k in range(2))
-        # by step, the engine's own one and foot: force and moment on the ground, and where they act
-        on_feet = felt[:, :, self._on_feet]
-        force = on_feet[..., 0, :]
+        # by step, the engine's own one and link: force and moment on the ground, where they act
+        links = felt[:, :, 3:].reshape(*felt.shape[:2], -1, 3, 3)
+        on_feet = links[:, :, self._feet - 1]
         total = on_feet[..., :2, :].sum(axis=1)
-        total[..., 1, :] += moments(on_feet[..., 2, :] - origins[:, None], force).sum(axis=1)
-        return (total / -on_feet.shape[1]).reshape(-1, 2, 6)
-
-    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        felt = np.array([note[0] for note in notes]).any(axis=1)
-        forces = felt[:, 3:].reshape(len(felt), -1, 3, 3)[:, :, 0]
-        return forces.any(axis=-1), felt[:, :3].any(axis=-1)
+        arms = on_feet[..., 2, :] - origins[:, None]
+        total[..., 1, :] += moments(arms, on_feet[..., 0, :]).sum(axis=1)
+        wrench = (total / -felt.shape[1]).reshape(-1, 2, 6)
+        return wrench, links[..., 0, :].any(axis=(1, 3)), felt[:, :, :3].any(axis=(1, 2))
 
     def _sole_points(self) -> np.ndarray:
         met = [note[2] for note in self._notes if note[2] is not None]
