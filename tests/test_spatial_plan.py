@@ -513,7 +513,7 @@ def test_the_servo_asks_for_the_planned_torques_if_it_knows_what_each_foot_carri
         assert command.wrench is not None
         for knows in worst:
             told = command if knows else replace(command, wrench=None)
-            off = servo.torque(told, tape.q[row], tape.v[row]) - player.tau[step]
+            off = servo.torque(told, tape.q[row], tape.v[row]) - command.tau
             worst[knows] = max(worst[knows], float(np.abs(off / effort).max()))
     assert worst[True] < 0.03 < worst[False] / 2  # on the toes their line moves a little in the plan
 
