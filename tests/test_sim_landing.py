@@ -43,9 +43,9 @@ class Catch:
                     self.worst_torque = max(self.worst_torque, np.max(np.abs(tau) / motors.effort))
                 world.set_torque(tau)
                 world.step()
-                contacts = world.contacts()
-                force, self.touching = contacts.wrench[:, 2], self.touching | contacts.touching
+                force = world.wrench()[:, 2]
             q, v = world.state()
+            self.touching = set(np.array(world.links)[world.log().touching.any(axis=0)])
         pin.centerOfMass(robot.model, data, q, v)
         self.com, self.speed, self.force = data.com[0].copy(), np.linalg.norm(data.vcom[0]), force.sum()
 

@@ -1,4 +1,4 @@
-"""Launch feedback: what it follows, what it feels, and robots that launch better by it."""
+"""Launch feedback: what it follows, and robots that launch better by it."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from paper.basin import WrongApex, landing_basin
 
 from jumplab.control import STAND_S
 from jumplab.control.kinematics import Gauge, State
-from jumplab.control.launch import ROLLING_S, LaunchFeedback
+from jumplab.control.launch import LaunchFeedback
 from jumplab.control.playback import Playback
 from jumplab.errors import InputError
 from jumplab.sim import INSTALLED, STEP_S, Perturbation, Ranges, SensorNoise, Shove, simulate_jump
@@ -75,28 +75,15 @@ def test_a_wrong_posture_moves_what_is_followed(bhr, tape):
     assert moved[k, 3] == pytest.approx(data.hg.angular, abs=0.05)
 
 
-# drives lag a little, 1.5 mm of the CoM that feet feel
-@pytest.mark.parametrize("mode, farthest_rad, off_m", [(MODE, 0.006, 0.002), (BASE, 0.005, 0.001)])
-def test_the_planned_robot_launches_as_planned(bhr, tape, mode, farthest_rad, off_m):
+@pytest.mark.parametrize("mode, farthest_rad", [(MODE, 0.006), (BASE, 0.005)])
+def test_the_planned_robot_launches_as_planned(bhr, tape, mode, farthest_rad):
     plain, led = (simulate_jump(tape, bhr, mode=mode, feedback=on, stand_s=0.5) for on in (False, True))
     said = led.settings["feedback"]
     assert plain.settings["feedback"] is None
     assert led.checks_passed and said["failures"] == 0 and said["solves"] > 400
-    assert said["farthest_rad"] < farthest_rad and abs(said["com_ahead_m"]) < off_m
+    assert said["farthest_rad"] < farthest_rad
     for name in ("foot_distance_m", "com_rise_m"):
         assert getattr(led.metrics, name) == pytest.approx(getattr(plain.metrics, name), abs=0.015)
-
-
-@pytest.mark.parametrize("place_m", [(0.09, 0.0, 0.1), (-0.09, 0.0, 0.0)])
-def test_feet_tell_where_the_com_is(bhr, tape, place_m):
-    """A payload before or behind the trunk: the true CoM, by Pinocchio, against the one that is felt last."""
-    loaded = Perturbation(payload_kg=4.0, payload_m=place_m, noise=NOISY)
-    run = simulate_jump(tape, bhr, perturbation=loaded, mode=MODE, feedback=True, stand_s=BRIEF_S)
-    real = loaded.robot(bhr)
-    last = round((float(tape.extra["toe_phase_start"]) - ROLLING_S) / STEP_S)
-    model, truth = (Gauge(robot).com(run.q[last])[0] for robot in (bhr, real))
-    assert abs(truth - model) > 0.004
-    assert run.settings["feedback"]["com_ahead_m"] == pytest.approx(truth - model, abs=0.004)
 
 
 def pitch_at_takeoff(run, tape):

@@ -150,11 +150,12 @@ def test_tape_says_how_each_foot_stands(task):
 def test_a_step_moves_one_foot_to_its_place(bhr):
     """The other one stays where it is; forces and momentum are those of the motion all the same."""
     plan, tape = step()
-    gauge, data, model = Gauge(bhr), bhr.model.createData(), bhr.model
+    data, model = bhr.model.createData(), bhr.model
+    frames = [model.getFrameId(name) for name in bhr.foot.frames]
     soles = []
     for q in tape.q:
         pin.framesForwardKinematics(model, data, q)
-        soles.append([[data.oMf[frame].act(x) for x in bhr.foot.corners] for frame in gauge.frames])
+        soles.append([[data.oMf[frame].act(x) for x in bhr.foot.corners] for frame in frames])
     soles, codes = np.array(soles), tape.extra["contacts"]
     assert np.abs(soles[:, 0] - soles[0, 0]).max() < 1e-6 and np.all(codes[:, 0] == FLAT)
     lifted = codes[:, 1] == AIR
@@ -170,7 +171,7 @@ def test_a_step_moves_one_foot_to_its_place(bhr):
         need = pin.rnea(model, data, tape.q[row], tape.v[row], tape.a[row])
         pin.computeJointJacobians(model, data, tape.q[row])
         pin.updateFramePlacements(model, data)
-        for frame, wrench in zip(gauge.frames, tape.f[row], strict=True):
+        for frame, wrench in zip(frames, tape.f[row], strict=True):
             need -= pin.getFrameJacobian(model, data, frame, axes).T @ wrench
         assert np.abs(need[:6]).max() < 1e-6 and need[6:] == pytest.approx(tape.tau[row], abs=1e-6)
     assert (plan.flight_s, plan.launch_s) == (0.0, pytest.approx(tape.t[-1], abs=1e-3))
@@ -191,10 +192,10 @@ def test_audit_is_clean_and_the_goal_is_reached(task):
 @pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
 def test_soles_come_down_steeply_enough_to_stick(task):
     plan = jump(task)
-    gauge, data = Gauge(plan.robot), plan.robot.model.createData()
+    data = plan.robot.model.createData()
     pin.forwardKinematics(plan.robot.model, data, plan.tape.q[-1], plan.tape.v[-1])
     used = []
-    for frame in gauge.frames:
+    for frame in map(plan.robot.model.getFrameId, plan.robot.foot.frames):
         arm = pin.updateFramePlacement(plan.robot.model, data, frame).rotation @ plan.robot.foot.center
         twist = pin.getFrameVelocity(plan.robot.model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         speed = twist.linear + np.cross(twist.angular, arm)
@@ -512,7 +513,7 @@ def test_the_servo_asks_for_the_planned_torques_if_it_knows_what_each_foot_carri
         assert command.wrench is not None
         for knows in worst:
             told = command if knows else replace(command, wrench=None)
-            off = servo.torque(told, tape.q[row], tape.v[row]) - player.tau[step]
+            off = servo.torque(told, tape.q[row], tape.v[row]) - command.tau
             worst[knows] = max(worst[knows], float(np.abs(off / effort).max()))
     assert worst[True] < 0.03 < worst[False] / 2  # on the toes their line moves a little in the plan
 

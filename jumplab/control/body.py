@@ -97,19 +97,15 @@ class WholeBody:
         self,
         v: np.ndarray,
         corners: np.ndarray,
-        moment: np.ndarray | None = None,
         leaning: np.ndarray | None = None,
     ) -> Qp:
         """A QP without wishes: the base's dynamics, the motors at the rates of ``v`` (nv,), and the
         ground's ``corners``, see :func:`corner_rows`.
 
-        ``moment`` (3,) about the CoM is needed besides, by a load that the model lacks [N m].
         Joints that are ``leaning`` (nv - 6,) on a stop come to rest on it within :data:`REST_S`;
         the stop adds to the torques of their motors.
         """
-        offset = self._offset.copy()
-        if moment is not None:
-            offset[3:6] += self.trunk.T @ moment
+        offset = self._offset
         qp = Qp(self.nx)
         qp.equality("base", self._dynamics[:6], -offset[:6])
         low, high = self.motors.range(v[6:])

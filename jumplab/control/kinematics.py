@@ -12,6 +12,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet
 
 LEVEL = np.eye(7)[6]  # place and quaternion (7,) of a base at the origin, not turned
 
@@ -113,21 +114,21 @@ class Gauge:
         self.robot = robot
         self.model = robot.model
         self.data = robot.model.createData()
-        # names checked by Robot
-        self.frames = [
-            robot.model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames
-        ]
+        self._feet = on_feet(robot, np.zeros(3))
 
     def places(self, q: np.ndarray) -> list[pin.SE3]:
         """Placements of both feet in ``q`` (nq,)."""
-        model = self.model
-        data = self.data
-        pin.forwardKinematics(model, data, q)
-        return [pin.updateFramePlacement(model, data, frame).copy() for frame in self.frames]
+        pin.forwardKinematics(self.model, self.data, q)
+        return [foot.place(self.data) for foot in self._feet]
 
     def feet(self, q: np.ndarray) -> np.ndarray:
         """Homogeneous transforms (N, 2, 4, 4) of both feet in ``q`` (N, nq) [m]."""
-        return np.array([[foot.homogeneous for foot in self.places(row)] for row in q])
+        joints = np.empty((len(q), 2, 4, 4))
+        for row, there in zip(q, joints, strict=True):
+            pin.forwardKinematics(self.model, self.data, row)
+            for side, foot in enumerate(self._feet):
+                there[side] = self.data.oMi[foot.joint].homogeneous
+        return joints @ np.array([foot.placement.homogeneous for foot in self._feet])
 
     def soles(self, q: np.ndarray) -> np.ndarray:
         """Mean of both soles' middles (3,) in ``q`` (nq,) [m]."""

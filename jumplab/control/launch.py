@@ -11,11 +11,6 @@ the torques that go with them.
 Feet that creep, as on contacts that give way, take the planned place of the CoM along, or the
 forces on them would turn the body. Its planned velocity is that in the world, and what the feet
 have lost of their way until take-off is made good by speed.
-
-Feet that stand flat measure where the CoM really is: a load that the trunk carries besides pushes
-them by its mass times the acceleration of the trunk, and turns them by that push about where it is.
-Its mass and place are filtered from the wrenches, and the real CoM is led along the planned one's
-way.
 """
 
 from __future__ import annotations
@@ -27,8 +22,8 @@ import pinocchio as pin
 
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS, WholeBody, corner_rows, solver
-from jumplab.control.kinematics import Gauge, State, about_vertical, rotation
-from jumplab.control.playback import AIR, FLAT, Command, Playback, Stand, resampled
+from jumplab.control.kinematics import Gauge, State, about_vertical
+from jumplab.control.playback import AIR, Command, Playback, Stand, resampled
 from jumplab.errors import InputError
 from jumplab.io import tape as tapes
 from jumplab.io.tape import Tape
@@ -39,10 +34,6 @@ from jumplab.robot.legs import BASE, leg_columns
 FRICTION = 0.6  # more than plans use, less than most floors have
 LENGTH_SHARE = 0.95  # of the sole for the CoP
 LEAST_LOAD = 0.5  # [1] of the weight; with less on the feet nothing is changed any more
-FELT_LOAD = 0.7  # [1] of the weight, with which feet measure where the CoM is ...
-STILL_RAD = 0.01  # ... unless they are tilted by so much
-ROLLING_S = 0.1  # before the heels rise: the CoP is on its way to the toes, and soles begin to tip
-MOST_OFF_M = 0.025  # that the CoM is believed to be off
 # of the flight, in which what was changed fades; natural times of that, to 4 %
 FADE_SHARE = 0.4
 FADED = 5.0
@@ -70,12 +61,6 @@ FOOT_WEIGHT = 1e4
 POSTURE_WEIGHT = 0.02
 SWING_WEIGHT = 1.0  # of a leg in the air, which is on its way to where it lands
 MOST = 40.0  # [rad/s^2] that a joint's acceleration may differ by from the tape's
-# standard deviations. Of the load on the trunk before anything is felt, in shares of the robot's
-# mass: its mass, and that times how far it is ahead of and above the base [m]
-PRIOR = 0.1, 0.02, 0.03
-# of one reading, in which all that moves unlike the model errs too, in shares of the push: push
-# up, and moment [m]
-READING = 0.07, 0.03
 
 
 def check_mode(mode: str) -> None:
@@ -91,8 +76,7 @@ class LaunchFeedback:
     """Changes the commands of one launch; see the module's docstring.
 
     Not for servos of mode "pd": feet begin to rock by what sensors err by. ``solver`` counts the
-    QPs posed and those without a solution, where the joints go back to the tape. ``off_m`` is how
-    far the CoM is believed to be ahead of where the robot's model has it [m].
+    QPs posed and those without a solution, where the joints go back to the tape.
     """
 
     def __init__(self, robot: Robot, tape: Tape, playback: Playback):
@@ -101,35 +85,26 @@ class LaunchFeedback:
         self._body = WholeBody(robot)
         self._gauge = Gauge(robot)
         self.solver = solver()
-        self.off_m = 0.0
         self._stand: Stand | None = None
         # pitch momentum that was missing since the heels rose, summed over time [kg m^2]
         self._unturned = 0.0
         self._speed = np.zeros(3)  # of the feet that carry, filtered [m/s]
         air_s = [np.ptp(tape.t[rows]) for rows in tape.flights]
         size = self._body.size
-        self._rolling = round(size.of(ROLLING_S, "s") / STEP_S)
-        self._most_off_m = size.of(MOST_OFF_M, "m")
         rates = COM_RATE, MOMENTUM_RATE, PITCH_RATE, POSTURE_RATE, FADE_RATE
         self._com_rate, self._momentum_rate, self._pitch_rate, self._posture_rate, fade_rate = (
             size.of(x, "rad/s") for x in rates
         )
         self._turning = size.of(1.0, "s") ** 4  # on weights of angular accelerations
-        self._reading = np.array([READING[0], size.of(READING[1], "m")])
         self._fade_rate = max([fade_rate, *(FADED / (FADE_SHARE * x) for x in air_s)])
         self._air_s = next(iter(air_s), np.inf)  # of the first flight
         # of the joints, off the tape
         self.angles, self._rates, self.changes = np.zeros((3, len(robot.joint_names)))
         self._torque: np.ndarray | float = 0.0  # besides the tape's
         self._farthest = 0.0  # [rad]
-        # mass on the trunk [kg], and that times its place ahead of and above the base [kg m]
-        self._load = np.zeros(3)
-        prior = np.array([PRIOR[0], *size.of(np.array(PRIOR[1:]), "m")])
-        self._spread = np.diag(np.square(prior)) * robot.total_mass**2
-        self._forward, self._left = about_vertical(self._gauge.heading(tape.q[0])).T[:2]
+        self._left = about_vertical(self._gauge.heading(tape.q[0]))[:, 1]
         self._first = tape.q[0]
         self.rows = self._planned(tape)
-        self._spin = self.rows[0, 4]  # rate of L that the last command takes
         flat = robot.foot.center, LENGTH_SHARE
         stands = {tapes.AIR: flat, tapes.TOE: (robot.foot.tip, 0.0), tapes.FLAT: flat}
         self._stands = {
@@ -139,18 +114,17 @@ class LaunchFeedback:
         self._legs = [leg - BASE for leg in leg_columns(robot)]
 
     def _planned(self, tape: Tape) -> np.ndarray:
-        """CoM, its velocity and acceleration, L, its rate, the base's acceleration, and the places
-        of the left and the right toe (steps, 8, 3) of the tape.
+        """CoM, its velocity and acceleration, L, its rate, and the places of the left and the right
+        toe (steps, 7, 3) of the tape.
         """
         mass = self._robot.total_mass
         gravity = self._robot.model.gravity.linear
         rows = []
-        for q, v, a, f in zip(tape.q, tape.v, tape.a, tape.f, strict=True):
-            base = rotation(q[3:7]) @ (a[:3] + np.cross(v[3:6], v[:3]))
+        for q, v, f in zip(tape.q, tape.v, tape.f, strict=True):
             now = self._gauge.motion(q, v)
             push = f[:, :3].sum(axis=0) / mass + gravity
             moment = self._moment(q, now.com, f)
-            rows.append([now.com, now.velocity, push, now.momentum, moment, base, *self._toes(q)])
+            rows.append([now.com, now.velocity, push, now.momentum, moment, *self._toes(q)])
         grid = np.arange(self.playback.steps + 1) * STEP_S
         return resampled(grid, tape.t, np.array(rows))
 
@@ -168,7 +142,6 @@ class LaunchFeedback:
             "solves": self.solver.solves,
             "failures": self.solver.failures,
             "farthest_rad": self._farthest,
-            "com_ahead_m": self.off_m,
         }
 
     def begin(self, q: np.ndarray) -> None:
@@ -195,10 +168,6 @@ class LaunchFeedback:
             self.changes = self._back(self._fade_rate)
             self._torque = 0.0
         elif step % PERIOD_STEPS == 0:
-            ahead = step + self._rolling
-            # an impact says nothing of loads
-            if ahead < self.playback.lands and self.playback.stands(ahead) == FLAT:
-                self._feel(state, self.rows[step])
             if self.rows[due, 2, 2] + self._robot.gravity < LEAST_LOAD * self._robot.gravity:
                 self.changes = -2 * self._posture_rate * self._rates
             else:
@@ -215,33 +184,6 @@ class LaunchFeedback:
             tau=command.tau + self._torque,
         )
 
-    def _feel(self, state: State, planned: np.ndarray) -> None:
-        """Learn from the feet's wrenches where the CoM is, unless they carry little or are tilted.
-
-        ``planned`` (8, 3) is the row of what is followed now. A load of mass m at p pushes by F = m
-        (a - g), with a the base's acceleration, and turns by p x F: linear in m and m p, of which a
-        Kalman filter keeps the mean.
-        """
-        mass = self._robot.total_mass
-        gravity = self._robot.gravity
-        push = state.wrench[:, 2].sum()
-        tilt = max(abs(foot.rotation[2, 0]) for foot in self._gauge.places(state.q))
-        if push < FELT_LOAD * mass * gravity or tilt > STILL_RAD:
-            return
-        com = self._gauge.com(state.q)
-        axes = rotation(state.q[3:7])
-        felt = self._moment(state.q, com, state.wrench) - self._spin
-        pull = planned[5] + [0.0, 0.0, gravity]
-        arms = np.array([state.q[:3] - com, axes[:, 0], axes[:, 2]])
-        sense = np.array([[pull[2], 0.0, 0.0], np.cross(arms, pull) @ self._left])
-        readings = np.array([push - mass * (planned[2, 2] + gravity), felt @ self._left])
-        noise = np.diag(np.square(self._reading * push))
-        gain = np.linalg.solve(sense @ self._spread @ sense.T + noise, sense @ self._spread).T
-        self._load = self._load + gain @ (readings - sense @ self._load)
-        self._spread = self._spread - gain @ sense @ self._spread
-        ahead = float(self._forward @ arms.T @ self._load) / (mass + float(self._load[0]))
-        self.off_m = float(np.clip(ahead, -self._most_off_m, self._most_off_m))
-
     def _solve(
         self, due: int, stand: Stand, q: np.ndarray, v: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -256,19 +198,16 @@ class LaunchFeedback:
         )
         body.update(q, v, anchors)
         body.set_contact(carries)
-        com, speed, push, momentum, spin, _, *toes = self.rows[due]
+        com, speed, push, momentum, spin, *toes = self.rows[due]
         # the plan goes on where the feet are, and ends where it would have
         moved = [1.0, 1.0, 0.0] * np.subtract(self._toes(q), toes)[carries].mean(axis=0)
         com = com + moved
         if due < self.playback.lands:
             speed = speed - moved / self._air_s
-        ahead = self.off_m * self._forward
-        # that the real CoM takes besides
-        moment = np.cross(ahead, body.mass * (push - body.gravity))
-        shift = self._com_rate**2 * (com - ahead - body.com)
+        shift = self._com_rate**2 * (com - body.com)
         shift = shift + 2 * self._com_rate * (speed - body.com_velocity)
         missing = momentum - body.momentum
-        turn = spin + moment + self._momentum_rate * missing
+        turn = spin + self._momentum_rate * missing
         rolls = tapes.TOE in stand
         if rolls:
             pitching = float(self._left @ missing)
@@ -278,7 +217,7 @@ class LaunchFeedback:
             turn = turn + (faster + pitch_rate**2 * self._unturned) * self._left
         tape = self.playback.acceleration(due)
         back = self._back(self._posture_rate)
-        qp = body.program(v, np.vstack(corners), moment)
+        qp = body.program(v, np.vstack(corners))
         body.balance(qp, push + shift, turn, (COM_WEIGHT, self._turning * MOMENTUM_WEIGHT))
         posture = np.full(len(back), self._turning * POSTURE_WEIGHT)
         creep = self._creep(stand, carries) if rolls else np.zeros(6)
@@ -294,9 +233,7 @@ class LaunchFeedback:
         qp.cost("wrenches", body.unknowns[body.nv :], 0.0, LEAST_WRENCH)
         answer = self.solver.solve(qp)
         if not answer.solved:
-            self._spin = spin
             return back, None
-        self._spin = body.momentum_rows @ answer.x - moment
         change = np.round(answer.x[6 : body.nv], DIGITS) - tape
         tau = np.round(body.torque(answer.x), TORQUE_DIGITS) + body.motors.lost(v[6:])
         most = body.size.of(MOST, "rad/s^2")

@@ -61,18 +61,21 @@ class Playback:
         self.lead = round(lead_s / STEP_S)
         self._gauge = Gauge(robot)
         self._grid = np.arange(self.steps + 1) * STEP_S
-        q, self._v, self.tau, self._wrench = (
-            resampled(self._grid, tape.t, x) for x in (tape.q, tape.v, tape.tau, tape.f)
-        )
-        self._q = q[:, 7:]
-        self._rate = self._v[:, 6:]
+        self._n = n = len(robot.joint_names)
+        q = resampled(self._grid, tape.t, tape.q)
+        self._v = resampled(self._grid, tape.t, tape.v)
+        tau = resampled(self._grid, tape.t, tape.tau)
+        change = np.diff(tau, axis=0, append=tau[-1:])
+        wrench = resampled(self._grid, tape.t, tape.f).reshape(-1, 12)
+        # angles, rates, torques, their changes and wrenches side by side: one row is read at a time
+        self._rows = np.hstack([q[:, 7:], self._v[:, 6:], tau, change, wrench])
+        self._q, self._rate, _, change = self._rows[:, : 4 * n].reshape(-1, 4, n).swapaxes(0, 1)
         last = np.searchsorted(tape.t, self._grid + STEP_S / 2, side="right") - 1
         self._stands = tape.contacts[last]
         changes = np.diff((self._stands > tapes.AIR).astype(int), axis=0)
         # the first step in which a foot comes down
         self.lands = int(np.argmax([*(changes > 0).any(axis=1), True])) + 1
-        self._change = np.diff(self.tau, axis=0, append=self.tau[-1:])
-        self._change[:-1][changes.any(axis=1)] = 0.0  # what the ground gives changes there at once
+        change[:-1][changes.any(axis=1)] = 0.0  # what the ground gives changes there at once
         moved = (self._stands != self._stands[0]).any(axis=1)
         # the first step in which a foot stands otherwise
         self._moves = int(np.argmax([*moved[:-1], True]))
@@ -99,18 +102,17 @@ class Playback:
         due = step + self.lead + shift_s / STEP_S
         q, v = self._arriving(due, q, v)
         at = min(max(due, 0.0), float(self.steps))
-        angles = between(self._q, at) + correction
-        rate = between(self._rate, at)
+        row = between(self._rows, at)
+        angles, rate, tau, change = row[: 4 * self._n].reshape(4, -1)
         acceleration = (1 + pace) ** 2 * (between(self._rate, at + 1.0) - rate) / STEP_S
-        rate = (1 + pace) * rate if at < self.steps else np.zeros(len(rate))
         return Command(
-            q=angles,
-            rate=rate,
+            q=angles + correction,
+            rate=(1 + pace) * rate if at < self.steps else np.zeros(self._n),
             acceleration=acceleration,
-            tau=between(self.tau, at),
-            change=between(self._change, at),
+            tau=tau,
+            change=change,
             feet=self.stands(at),
-            wrench=between(self._wrench, at),
+            wrench=row[4 * self._n :].reshape(2, 6),
             state=(q, v),
         )
 

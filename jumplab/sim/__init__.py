@@ -31,7 +31,7 @@ __getattr__, __dir__, __all__ = lazy.attach(
     submodules=["checks"],
     submod_attrs={
         "causes": ["Sign", "signs"],
-        "bullet": ["BulletEngine", "base_from_bullet", "base_to_bullet"],
+        "bullet": ["BulletEngine", "base_to_bullet"],
         "engine": ["Engine", "engine_class"],
         "loop": ["Disturbance", "simulate_jump"],
         "mujoco": ["MujocoEngine"],

@@ -40,7 +40,8 @@ HARD = Contact({"numSolverIterations": 1000, "contactERP": 0.1, "contactSlop": 1
 # friction combines as a product: the robot's coefficient is the effective one
 GROUND_FRICTION = 1.0
 NOTHING = np.zeros((0, 16))  # what is noted of points on which ground presses, where it does not
-NOWHERE = [(0.0,) * 6 + (1.0,)] * 2  # places and attitudes of the feet, where nothing presses
+# places and attitudes of the feet, where nothing presses
+NOWHERE = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]] * 2)
 FASTEST = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
 
 
@@ -117,20 +118,6 @@ def base_to_bullet(
     return q[:3] + attitude @ lever, q[3:7].copy(), velocity, attitude @ v[3:6]
 
 
-def base_from_bullet(
-    position: np.ndarray,
-    quaternion: np.ndarray,
-    velocity: np.ndarray,
-    rate: np.ndarray,
-    lever: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
-    attitude = rotation(quaternion)
-    twist = np.array([velocity, rate]) @ attitude
-    twist[0] += pin.skew(lever) @ twist[1]
-    return np.concatenate([position - attitude @ lever, quaternion]), twist.ravel()
-
-
 class BulletEngine(Engine):
     """PyBullet behind the interface of :class:`.engine.Engine`."""
 
@@ -195,6 +182,7 @@ class BulletEngine(Engine):
         self._feet = [self.links.index(name) - 1 for name in self.robot.foot.frames]
         lever, tilt = self._bullet.getDynamicsInfo(self._body, -1)[3:5]
         self._lever = np.array(lever)
+        self._arm = pin.skew(self._lever)
         if abs(abs(tilt[3]) - 1) > 1e-9:
             raise RobotError(
                 f"robot {self.robot.name}: the inertial frame of {base} is turned; "
@@ -254,13 +242,17 @@ class BulletEngine(Engine):
         )
 
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
-        pose = self._bullet.getBasePositionAndOrientation(self._body)
+        place, turn = self._bullet.getBasePositionAndOrientation(self._body)
         twist = self._bullet.getBaseVelocity(self._body)
-        base_q, base_v = base_from_bullet(*pose, *twist, self._lever)
-        rows = self._bullet.getJointStates(self._body, self._joints)
-        angles = [row[0] for row in rows]
-        rates = [row[1] for row in rows]
-        return np.concatenate([base_q, angles]), np.concatenate([base_v, rates])
+        angles, rates, *_ = zip(*self._bullet.getJointStates(self._body, self._joints), strict=True)
+        attitude = rotation(turn)
+        q = np.array([*place, *turn, *angles])
+        v = np.array([*twist[0], *twist[1], *rates])
+        # the inverse of :func:`base_to_bullet`
+        q[:3] -= attitude @ self._lever
+        v[:6] = (v[:6].reshape(2, 3) @ attitude).ravel()
+        v[:3] += self._arm @ v[3:6]
+        return q, v
 
     def set_torque(self, tau: np.ndarray) -> None:
         """Torque of every joint for the next step [N m]."""
@@ -304,26 +296,23 @@ class BulletEngine(Engine):
             if row[2] != self._body
         ]
         self.fallen = any(point[0] not in self._feet for point in points)
-        feet = NOWHERE
-        if points:
-            states = [self._bullet.getLinkState(self._body, foot) for foot in self._feet]
-            feet = [state[4] + state[5] for state in states]
-        self._notes.append((np.array(points) if points else NOTHING, len(points) < len(rows), feet))
+        if not points:
+            self._notes.append((NOTHING, bool(rows), NOWHERE))
+            return
+        states = [self._bullet.getLinkState(self._body, foot) for foot in self._feet]
+        feet = np.array([state[4] + state[5] for state in states])
+        self._notes.append((np.array(points), len(points) < len(rows), feet))
 
-    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
+    def _pressed(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         step, link, arm, force, _ = self._presses(notes)
         wrench = np.zeros((len(notes), 2, 6))
         pushes = np.hstack([force, moments(arm, force)])
         for side, foot in enumerate(self._feet):
             on_it = link == foot
             np.add.at(wrench[:, side], step[on_it], pushes[on_it])
-        return wrench
-
-    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        step, link, *_ = self._presses(notes)
         touching = np.zeros((len(notes), len(self.links)), bool)
         touching[step, link + 1] = True
-        return touching, np.array([note[1] for note in notes])
+        return wrench, touching, np.array([note[1] for note in notes])
 
     def _presses(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, ...]:
         """Of all k points that were noted: step, link, place (k, 3) from the foot, force (k, 3) and

@@ -19,7 +19,7 @@ from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.robot import Robot
 from jumplab.sim import CONTACTS, DEFAULT_ENGINE, ENGINES, INSTALLED
 from jumplab.sim.perturbation import FRICTION
-from jumplab.sim.scene import Contacts, Scene
+from jumplab.sim.scene import Scene
 
 # by how much an engine's mass, and its friction, may differ from what was asked for
 MASS_KG = 1e-6
@@ -198,17 +198,15 @@ class Engine(ABC):
 
     @abstractmethod
     def _advance(self) -> None:
-        """Take a step, append to ``_notes`` what the next two need of it, and set ``fallen``:
+        """Take a step, append to ``_notes`` what the next ones need of it, and set ``fallen``:
         whether a link that is no foot touched the ground.
         """
 
     @abstractmethod
-    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
-        """Wrenches on the feet (n, 2, 6) in n steps that were noted."""
-
-    @abstractmethod
-    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        """Which links touched the ground (n, links), and whether links touched each other (n,)."""
+    def _pressed(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """In n steps that were noted, the wrenches on the feet (n, 2, 6), which links touched the
+        ground (n, links), and whether links touched each other (n,).
+        """
 
     @abstractmethod
     def _sole_points(self) -> np.ndarray:
@@ -218,21 +216,12 @@ class Engine(ABC):
         """Force and moment of the ground on each foot in the last step (2, 6), world axes, at the
         origin of the foot link [N, N m].
         """
-        return self._wrenches(self._notes[-1:])[0] if self._notes else np.zeros((2, 6))
-
-    def contacts(self) -> Contacts:
-        """Contacts of the last step, and their forces."""
-        if not self._notes:
-            return Contacts(self.wrench(), frozenset(), False)
-        touching, colliding = (x[0] for x in self._touched(self._notes[-1:]))
-        links = frozenset(self.links[k] for k in np.flatnonzero(touching))
-        return Contacts(self.wrench(), links, bool(colliding))
+        return self._pressed(self._notes[-1:])[0][0] if self._notes else np.zeros((2, 6))
 
     def log(self) -> Log:
         """All steps so far."""
-        notes = self._notes
         columns = map(np.array, zip(*self._steps, strict=True))
-        return Log(*columns, self._wrenches(notes), *self._touched(notes))
+        return Log(*columns, *self._pressed(self._notes))
 
     def spring(self, soft_m: float) -> tuple[float, float]:
         """Stiffness [N/m] and damping [N s/m] of one contact point of ground into which flat soles,

@@ -116,6 +116,10 @@ class MujocoEngine(Engine):
             self._sense(spec, body, link, body, "world", NET)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
+        data = self._data
+        # views: to ask the engine for one takes as long as to read it
+        self._sensed, self._applied = data.sensordata, data.qfrc_applied
+        self._places, self._attitudes = data.xpos, data.xmat
         self._model.jnt_solref[:] = [contact.time_s, contact.damping_ratio]
         self._index_links()
         self._soften(friction)
@@ -185,11 +189,11 @@ class MujocoEngine(Engine):
             getattr(model, there)[self._v[6:]] = getattr(self._motors, key)
         self._feet = np.array([model.body(name).id for name in self.robot.foot.frames])
         self._torque = np.zeros(len(joints))
+        self._back = np.zeros(4)  # from the world into the base's axes
         # of the contact sensors in a step: all of them, those of the feet, forces on other links
         self._felt = np.zeros((self.contact.substeps, model.nsensordata))
-        columns = 3 + np.arange(9 * len(self.links)).reshape(-1, 3, 3)
-        self._on_feet = columns[self._feet - 1]
-        self._stray = np.delete(columns, self._feet - 1, axis=0)[:, 0].ravel()
+        columns = 3 + np.arange(9 * len(self.links)).reshape(-1, 9)
+        self._stray = np.delete(columns, self._feet - 1, axis=0)[:, :3].ravel()
 
     def close(self) -> None:
         """Free the engine."""
@@ -238,14 +242,15 @@ class MujocoEngine(Engine):
         return np.where(rank[ground] == rank[geom], larger, ranked)
 
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
-        q = self._data.qpos[self._q]
-        v = self._data.qvel[self._v]
-        v[:3] = rotation(q[3:7]).T @ v[:3]
-        return q, v
+        data = self._data
+        v = data.qvel[self._v]
+        mujoco.mju_negQuat(self._back, data.qpos[3:7])
+        mujoco.mju_rotVecQuat(v[:3], data.qvel[:3], self._back)
+        return data.qpos[self._q], v
 
     def set_torque(self, tau: np.ndarray) -> None:
         """Torque of every joint for the next step [N m]."""
-        self._data.qfrc_applied[self._v[6:]] = tau
+        self._applied[self._v[6:]] = tau
 
     def push(self, force: np.ndarray, place: np.ndarray) -> None:
         """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's
@@ -264,43 +269,45 @@ class MujocoEngine(Engine):
         for substep in range(self.contact.substeps):
             mujoco.mj_step(self._model, data)
             if substep == 0:
-                origins = data.xpos[self._feet]
-            self._felt[substep] = data.sensordata
-        self._torque = data.qfrc_applied[self._v[6:]]
+                origins = self._places[self._feet]
+            self._felt[substep] = self._sensed
+        self._torque = self._applied[self._v[6:]]
         data.xfrc_applied[1] = 0.0
-        felt = self._felt.any(axis=0)
-        self.fallen = bool(felt[self._stray].any())
-        has = data.contact
-        places = has.geom, has.pos, has.frame, has.dist, data.xpos, data.xmat
-        note = self._felt[:, self._on_feet], origins, felt
-        self._notes.append((*note, *(x.copy() for x in places)))
+        felt = self._felt.copy()
+        met = None
+        if data.ncon:
+            has = data.contact
+            feet = self._places[self._feet], self._attitudes[self._feet]
+            met = has.geom.copy(), has.pos.copy(), has.frame.copy(), has.dist.copy(), *feet
+        # a link that lies on the ground is still there at the end of the step
+        self.fallen = met is not None and np.count_nonzero(felt[:, self._stray]) > 0
+        self._notes.append((felt, origins, met))
 
-    def _wrenches(self, notes: list[tuple[Any, ...]]) -> np.ndarray:
+    def _pressed(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Forces are means over a step; moments are about where the feet were before it."""
-        on_feet, origins = (np.array([note[k] for note in notes]) for k in range(2))
-        # by step, the engine's own one and foot: force and moment on the ground, and where they act
-        force = on_feet[..., 0, :]
+        felt, origins = (np.array([note[k] for note in notes]) for k in range(2))
+        # by step, the engine's own one and link: force and moment on the ground, where they act
+        links = felt[:, :, 3:].reshape(*felt.shape[:2], -1, 3, 3)
+        on_feet = links[:, :, self._feet - 1]
         total = on_feet[..., :2, :].sum(axis=1)
-        total[..., 1, :] += moments(on_feet[..., 2, :] - origins[:, None], force).sum(axis=1)
-        return (total / -on_feet.shape[1]).reshape(-1, 2, 6)
-
-    def _touched(self, notes: list[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        felt = np.array([note[2] for note in notes])
-        forces = felt[:, 3:].reshape(len(felt), -1, 3, 3)[:, :, 0]
-        return forces.any(axis=-1), felt[:, :3].any(axis=-1)
+        arms = on_feet[..., 2, :] - origins[:, None]
+        total[..., 1, :] += moments(arms, on_feet[..., 0, :]).sum(axis=1)
+        wrench = (total / -felt.shape[1]).reshape(-1, 2, 6)
+        return wrench, links[..., 0, :].any(axis=(1, 3)), felt[:, :, :3].any(axis=(1, 2))
 
     def _sole_points(self) -> np.ndarray:
-        touched = [note[3:] for note in self._notes if len(note[3])]
-        if not touched:
+        met = [note[2] for note in self._notes if note[2] is not None]
+        if not met:
             return np.zeros((0, 3))
-        *contacts, xpos, xmat = zip(*touched, strict=True)
+        *contacts, origins, turns = zip(*met, strict=True)
         geoms, place, frame, depth = map(np.concatenate, contacts)
-        step = np.repeat(np.arange(len(xpos)), [len(x) for x in contacts[0]])
+        step = np.repeat(np.arange(len(met)), [len(x) for x in contacts[0]])
         pairs = self._model.geom_bodyid[geoms]
         body = pairs.max(axis=1)
+        side = (body == self._feet[1]).astype(int)
         # a contact's place is in the middle of its depth, its axis leads to the second body
         half = np.where(pairs[:, 1] == body, 0.5, -0.5) * depth
-        arm = place + half[:, None] * frame[:, :3] - np.array(xpos)[step, body]
-        turn = np.array(xmat)[step, body].reshape(-1, 3, 3)
+        arm = place + half[:, None] * frame[:, :3] - np.array(origins)[step, side]
+        turn = np.array(turns)[step, side].reshape(-1, 3, 3)
         on_foot = np.isin(body, self._feet) & (pairs.min(axis=1) == 0)
         return (arm[:, None, :] @ turn)[on_foot, 0]

@@ -26,16 +26,6 @@ STRAIGHT_RAD = 1e-9  # a heading that differs from +x by rounding alone is strai
 GAP_M = 0.02
 
 
-@dataclass(frozen=True)
-class Contacts:
-    """Contacts of the robot in one step."""
-
-    # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
-    wrench: np.ndarray
-    touching: frozenset[str]  # the robot's links that press on the ground
-    colliding: bool  # whether links of the robot press on each other
-
-
 @checked
 @dataclass(frozen=True)
 class Block:
