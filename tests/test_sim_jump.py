@@ -128,6 +128,9 @@ def test_what_was_saved_is_loaded(bhr, look, odd_folder):
     said = json.loads(path.read_text())
     assert said["planned_distance_m"] == DISTANCE and said["foot_distance_m"] == look.metrics.foot_distance_m
     assert said["schema"] == str(before["schema"]) and said["settings"]["mode"] == "position"
+    older = {k: v for k, v in said.items() if "checks" not in k} | {"honesty": said["checks"]}
+    path.write_text(json.dumps(older))
+    assert SimulationResult.load(odd_folder, bhr).checks == look.checks
     texts = (text.replace("left_knee", "left_knie") for text in (bhr.urdf, bhr.config_text))
     with pytest.raises(InputError, match="not a simulation of this folder's robot"):
         SimulationResult.load(odd_folder, Robot.from_text(*texts))

@@ -230,7 +230,7 @@ class SimulationResult(Shown, Named):
         if not (Path(folder) / SIMULATION_NAME).is_file():
             return None
         logs = read_simulation(folder, robot, LOGS)
-        report = read_json(Path(folder) / REPORT_NAME)
+        report = checks_named(read_json(Path(folder) / REPORT_NAME))
         try:
             names = {name: tuple(logs.pop(name).tolist()) for name in ("link_names", "joint_names")}
             if {len(log) for log in logs.values()} != {logs["t"].size}:
@@ -260,6 +260,12 @@ LOGS = tuple(
     for f in fields(SimulationResult)
     if f.name not in ("metrics", "settings", "checks", "robot")
 )
+OLD_NAMES = {"honest": "checks_passed", "honesty": "checks"}  # in reports of earlier versions
+
+
+def checks_named(report: dict) -> dict:
+    """A ``report``, the content of ``simulation.json``, in today's words."""
+    return {OLD_NAMES.get(name, name): value for name, value in report.items()}
 
 
 def record(
