@@ -19,7 +19,7 @@ from jumplab.arguments import checked
 from jumplab.auditing import AuditReport
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
-from jumplab.ocp.nlp import left_s, patience, unexplained
+from jumplab.ocp.nlp import LEAST_S, left_s, patience, unexplained
 from jumplab.ocp.problem import Term
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
@@ -398,7 +398,7 @@ class _Search:
                     body = self.stage.refined(program, Asked(self.task, near=best), RECORD)
                 else:
                     near = best if made is None else made[1]
-                    with patience(min(left_s(), HALVING_S * program.size)):
+                    with patience(max(LEAST_S, min(left_s(), HALVING_S * program.size))):
                         body = self.stage.plan(self.at(self.task, share), near=near)
                 plan = JumpPlan.of(robot, "direct", body)
                 failed = ", ".join(check.name for check in plan.audit.failed)
