@@ -1,19 +1,25 @@
 """Bounds for every motion: they hold for point masses at their best, for postures and for plans at hand."""
 
+import contextlib
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump, planner
+from paper import records
 from scipy.optimize import linprog
 
 import jumplab as jl
-from jumplab.errors import InfeasibleError, InputError
+from jumplab.errors import InfeasibleError, InputError, JumplabError
 from jumplab.robot.contact import on_feet
 from jumplab.robot_import.urdf import have_published
 from jumplab.stages.whole_body import Limits, WholeBodyPlanner
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.bounds import most, reach_and_start
 from jumplab.studies import advice
+from jumplab.task import RANGES
 
 STEPS = 60  # of a push
 published = pytest.mark.skipif(not have_published(), reason="needs the published robots")
@@ -135,6 +141,47 @@ def test_a_refusal_names_the_record_that_is_near(bhr, monkeypatch):
     no = InfeasibleError("no plan")
     said = [str(advice.advised(no, jl.Planner(other), jl.JumpTask(0.0, rise))) for rise in (0.7, 0.8)]
     assert "record" not in said[0] and "the record of bhr is a height of at least 0.900 m" in said[1]
+
+
+def recorded():
+    """Records on file, each with its robot; those of robots that are not here are left out."""
+    for row in records.rows():
+        with contextlib.suppress(JumplabError):
+            yield row, jl.Robot.load(row["robot"])
+
+
+def test_refusals_name_the_records_on_file_of_robots_with_a_name(monkeypatch):
+    """A tenth more than each record, and none of a robot that was changed."""
+    assert advice.RECORDS.read_text(encoding="utf-8") == records.shipped()
+    monkeypatch.setattr(advice, "TRIES", 0)
+    no = InfeasibleError("no plan")
+    told = 0
+    for row, robot in recorded():
+        if row["value"] is None or 1.1 * row["value"] > RANGES[row["what"]][2]:
+            continue
+        said = []
+        for x in (robot, robot.with_mass(factor=1.01)):
+            planner = SimpleNamespace(robot=x)
+            asked = jl.JumpTask(0.0, 0.02 if row["what"] != "height_m" else 1.1 * row["value"])
+            task = dataclasses.replace(asked, **{row["what"]: 1.1 * row["value"]})
+            said.append(str(advice.advised(no, planner, task)))
+        assert f"at least {row['value']:.3f}" in said[0] and "the record of" not in said[1], row
+        told += 1
+    assert told >= 2
+
+
+def test_no_record_on_file_beats_a_bound():
+    """Each with the rest of its target as it was planned; a distance is bounded with its rise."""
+    count = 0
+    for row, robot in recorded():
+        what = row["what"]
+        if row["value"] is None or what == "yaw_rad":
+            continue
+        near = records.JumpTask(0.0, row["rise_m"])
+        assert row["value"] <= most(Body(robot), Limits(), near, what), row
+        assert row["rise_m"] <= most(Body(robot), Limits(), near, "height_m"), row
+        count += 1
+    assert count >= 3
 
 
 @published

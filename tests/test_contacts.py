@@ -276,7 +276,7 @@ def test_a_block_lies_ahead_on_level_ground(bhr):
     first, last, top = over.over
     step, sole = STEP_SHARE * leg_length(bhr), bhr.foot.toe - bhr.foot.heel
     assert top == 0.2 and step < first < last < over.places[-1].ahead_m - sole
-    with pytest.raises(InputError, match="give .from, to, top. of a block"):
+    with pytest.raises(InputError, match=r"give \(from, to, top\) of a block"):
         replace(over, over=(0.5, 0.4, 0.2))
     lower = tuple(replace(place, up_m=-0.1) for place in over.places[1:])
     with pytest.raises(InputError, match="a block lies on level ground"):

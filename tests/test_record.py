@@ -12,6 +12,7 @@ from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.ocp import Bound, Nlp, Phase, PhaseGuess, Problem, Term
 from jumplab.ocp.nlp import patience
+from jumplab.robot_import.urdf import have_published
 from jumplab.show import price_bars
 from jumplab.studies import record as study
 
@@ -92,6 +93,14 @@ def test_a_robot_without_an_easy_jump_has_no_record(bhr):
     none = r"no record of height_m, since none of 5 easy jumps"
     with patience(1.0), pytest.raises(InfeasibleError, match=none):
         jl.record(bhr.with_limits(effort=0.1), "height_m", engines=())
+
+
+@pytest.mark.skipif(not have_published(), reason="needs the published robots")
+@pytest.mark.parametrize(("robot", "what", "least"), [("alexander", "height_m", 0.23), ("talos", "platform_m", 0.055)])
+def test_a_record_passes_its_audit_near_the_largest_number_at_the_nodes(robot, what, least):
+    """Alexander would lay its trunk on the ground; a finer mesh alone leads Talos to less than a third."""
+    found = jl.record(robot, what, engines=())
+    assert found.audit.passed and found.alike >= 3 and found.value > max(least, 0.97 * found.best)
 
 
 def test_where_an_easy_jump_is_not_easy_half_of_it_is_the_start(bhr, monkeypatch):

@@ -19,7 +19,7 @@ from jumplab.arguments import checked
 from jumplab.auditing import AuditReport
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, quoted
 from jumplab.io.progress import tell
-from jumplab.ocp.nlp import unexplained
+from jumplab.ocp.nlp import LEAST_S, left_s, patience, unexplained
 from jumplab.ocp.problem import Term
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
@@ -52,8 +52,9 @@ GROWS = 1.5  # times the number before, from one plan to the next
 # shares of the best that they led to, whose own plans, of least effort, are the next starts
 CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
-# shares of it, of which the first that passes its audit counts
-STEPS_BACK = 1.0, 0.99, 0.98, 0.96, 0.93, 0.9, 0.85, 0.8, 0.7
+# at the nodes, of the best; halvings of the share between the largest plan and what has none
+HALVINGS = 5
+HALVING_S = 3e-3  # processor time of each, per unknown of the program [s]
 LESS = 0.05  # of the share of a record that is played next, where a robot falls
 TRIED = 5  # shares that are played
 NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds
@@ -233,9 +234,12 @@ def record(
             raise InputError(f"engine {quoted(engine)}: choose from {', '.join(ENGINES)}, or none")
     changes = dict(terms=terms, weights=weights, off=off, limits=limits, mesh=mesh)
     planner = Planner(robot, keep=True, **changes)
+    search = _Search(planner, what, given)
     with unexplained():
-        search = _Search(planner, what, given)
         found, best = search.from_easy()
+    if best is None:
+        raise search.refusal(found)
+    with unexplained():
         plan, solved, program = search.plan_at(best)
         share, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
@@ -262,6 +266,7 @@ class _Search:
         if given is None and what != "height_m":
             names.append("takeoff_speed")
         self.sought = tuple(names)
+        self.climbs = what == "yaw_rad" or not self.given.standing
 
     def program(self, task: JumpTask) -> Program:
         """The one in which the number is an unknown, on a mesh of which little is left to gain; of
@@ -290,56 +295,64 @@ class _Search:
         for share in CLIMB if best and not alone else ():
             yield self.at(max(best, key=lambda x: x[0])[1], share)
 
-    def from_easy(self) -> tuple[dict[str, float], Solved]:
-        """Results of all starts, and the best one."""
+    def from_easy(self) -> tuple[dict[str, float], Solved | None]:
+        """Results of all starts, and the best one; None if none of them led anywhere."""
         found: dict[str, float] = {}
         best: list[tuple] = []
-        refusal = None
         for task in self.starts(best):
             size = f"{getattr(task, self.what):.3f} {unit_of(self.what)}"
             word = f"{size}, rise {task.height_m:.3f} m"
             tell(f"record of {self.planner.robot.name} from {word}")
             found[word] = math.nan
+            self.task = task
             try:
                 # after steps links meet, and a record begins with their rows
                 begin = self.stage.solved if task.standing else self.stage.plan
                 near = begin(task)
-                if self.what == "yaw_rad" or not task.standing:
-                    task, near = self.climbed(task, near)
+                if self.climbs:
+                    most = max((x[0] for x in best), default=RANGES[self.what][2])
+                    task, near = self.climbed(task, near, most)
                 program = self.program(task)
-                solved = self.leapt(program, Asked(task, near=near))
-            except (InfeasibleError, SolverError) as e:
-                refusal = e
+                solved = self.largest(program, Asked(task, near=near))
+            except (InfeasibleError, SolverError):
                 continue
             reached = program.found(task, solved)
             self.refuse_end(reached, solved)
             found[word] = getattr(reached, self.what)
             best.append((found[word], reached, solved))
         if not best:
-            raise InfeasibleError(
-                f"robot {self.planner.robot.name}: no record of {self.what}, since none of "
-                f"{len(found)} easy jumps led to one; the last one: {refusal}"
-            ) from refusal
-        _, task, solved = max(best, key=lambda x: x[0])
-        self.task = task
+            return found, None
+        _, self.task, solved = max(best, key=lambda x: x[0])
         return found, solved
 
-    def leapt(self, program: Program, asked: Asked) -> Solved:
-        """The largest number from where ``asked`` begins; with a low barrier where a high one,
-        which leaves the start far behind, leads nowhere.
-        """
-        with suppress(SolverError):
-            return program.solve_apart(asked, SEEKING)
-        return program.solve_apart(asked, RECORD)
+    def refusal(self, found: Mapping[str, float]) -> InfeasibleError:
+        """Reason why there is no record: that of the last easy jump, the smallest."""
+        why = "it has a plan, which leads nowhere"
+        try:
+            self.stage.plan(self.task)
+        except (InfeasibleError, SolverError) as e:
+            why = str(e)
+        return InfeasibleError(
+            f"robot {self.planner.robot.name}: no record of {self.what}, since none of "
+            f"{len(found)} easy jumps led to one; the last one: {why}"
+        )
 
-    def climbed(self, task: JumpTask, near: Solved) -> tuple[JumpTask, Solved]:
-        """The largest turn, or flight after steps, that plans lead to, each from the one before,
-        with rows for the links that met on the way: where the largest is sought at once, legs pass
-        through each other.
+    def largest(self, program: Program, asked: Asked) -> Solved:
+        """The largest number from one plan: at once where that is far off; after a climb, from
+        where little is left, with the start for that, and at once if it fails.
         """
-        largest = RANGES[self.what][2]
+        if self.climbs:
+            with suppress(SolverError):
+                return program.solve_apart(asked, RECORD)
+        return program.solve_apart(asked, SEEKING)
+
+    def climbed(self, task: JumpTask, near: Solved, most: float) -> tuple[JumpTask, Solved]:
+        """The largest turn, or flight after steps, below ``most`` [rad, m] that plans lead to, each
+        from the one before, with rows for the links that met on the way: where the largest is
+        sought at once, legs pass through each other.
+        """
         with suppress(InfeasibleError, SolverError):
-            while GROWS * getattr(task, self.what) < largest:
+            while GROWS * getattr(task, self.what) < most:
                 more = self.at(task, GROWS)
                 program = self.stage.program(more)
                 near = program.solve_apart(Asked(more, near=near), FROM_NEIGHBOUR[0])
@@ -370,42 +383,47 @@ class _Search:
                 )
 
     def plan_at(self, best: Solved) -> tuple[JumpPlan, Solved, Program]:
-        """The largest plan that passes its audit: the record on a mesh that is fine enough, else a
-        little less;
-        with the record in the program's words.
+        """The largest plan that passes its audit: the record on a mesh that is fine enough, or a
+        share of it, halfway to what has no plan; with the record in the program's words.
         """
         robot = self.planner.robot
         program = self.program(self.task)
+        most = getattr(self.task, self.what)
         failed = ""
-        reached = self.task
-        for share in STEPS_BACK:
+        made = None
+        low, share, high = 0.0, 1.0, 1.0
+        for _ in range(1 + HALVINGS):
             try:
-                if share == 1:
-                    body = self.stage.refined(program, Asked(reached, near=best), RECORD)
-                    reached = body.task  # finer meshes may allow less
+                if share == 1:  # finer meshes may allow less
+                    body = self.stage.refined(program, Asked(self.task, near=best), RECORD)
                 else:
-                    body = self.stage.plan(self.at(reached, share), near=best)
+                    near = best if made is None else made[1]
+                    with patience(max(LEAST_S, min(left_s(), HALVING_S * program.size))):
+                        body = self.stage.plan(self.at(self.task, share), near=near)
+                plan = JumpPlan.of(robot, "direct", body)
+                failed = ", ".join(check.name for check in plan.audit.failed)
             except (InfeasibleError, SolverError) as e:
                 failed = str(e)
-                continue
-            plan = JumpPlan.of(robot, "direct", body)
-            if plan.audit.passed:
+            if failed:
+                high = share
+            else:
+                made = plan, body, share
+                low = getattr(body.task, self.what) / most
+            if high - low <= 2 * SAME:
                 break
-            failed = ", ".join(check.name for check in plan.audit.failed)
-        else:
+            share = (low + high) / 2
+        if made is None:
             raise SolverError(
-                f"robot {robot.name}: {self.what} reaches {getattr(self.task, self.what):.3f} at "
-                f"the nodes, but no plan down to {share:.0%} of it passes the audit ({failed})"
+                f"robot {robot.name}: {self.what} reaches {most:.3f} at the nodes, but no plan "
+                f"down to {high:.0%} of it passes the audit ({failed})"
             )
+        plan, body, share = made
         if share == 1:
             contacts = body.schedule.contacts
-            finest = (
-                program if contacts == program.contacts else replace(program, contacts=contacts)
-            )
-            try:
+            same = contacts == program.contacts
+            finest = program if same else replace(program, contacts=contacts)
+            with suppress(SolverError):
                 return plan, finest.solve(Asked(body.task, near=body), RECORD), finest
-            except SolverError:
-                pass
         return plan, best, program
 
     def at(self, task: JumpTask, share: float) -> JumpTask:

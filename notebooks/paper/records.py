@@ -1,12 +1,13 @@
 """Records of the robots by name: the rows of ``records.jsonl``.
 
 ``python -m paper.records`` in the folder of the notebooks seeks what :data:`LOG` lacks, a line a record, and can be
-stopped and started again; ``python -m paper.records table`` prints the file. A record is a lower bound, found by a
-local solver.
+stopped and started again; at its end it writes the file from which refusals name records. ``python -m paper.records
+table`` prints the log. A record is a lower bound, found by a local solver.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import time
@@ -17,12 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from jumplab.errors import JumplabError
+from jumplab.io.files import write_file
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED
 from jumplab.show.tables import Table, table
 from jumplab.stages.whole_body import Limits
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.bounds import most
+from jumplab.studies.advice import RECORDS
 from jumplab.studies.record import record
 from jumplab.task import JumpTask
 from paper import logs
@@ -50,7 +53,7 @@ def row(name: str, what: str) -> dict[str, Any]:
     found: dict[str, Any] = {"robot": name, "what": what, "value": None}
     try:
         robot = Robot.load(name)
-        found["planar"] = robot.planar
+        found |= {"hash": robot.hash, "planar": robot.planar}
         best = record(robot, what)
         ends = dict.fromkeys(f"{x.joint.replace('_', ' ')} {x.limit}".strip() for x in best.limits)
         found |= {
@@ -85,6 +88,16 @@ def missing(done: Any) -> Iterator[tuple[str, str]]:
     for name, what in sorted(cases, key=lambda case: not planar[case[0]]):
         if f"{name} {what}" not in done:
             yield name, what
+
+
+def shipped() -> str:
+    """Text of the file that refusals read: the records in full numbers by the robots' hashes."""
+    by: dict[str, dict[str, float]] = {}
+    for x in rows():
+        if x["value"] is not None:
+            by.setdefault(x["hash"], {})[x["what"]] = x["value"]
+    lines = (f" {json.dumps(robot)}: {json.dumps(by[robot])}" for robot in sorted(by))
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def records_table() -> Table:
@@ -125,6 +138,7 @@ def main() -> None:
             found = row(name, what)
             log.add({"key": f"{name} {what}", "row": found})
             print(found, flush=True)
+    write_file(RECORDS, shipped().encode())
 
 
 if __name__ == "__main__":

@@ -31,9 +31,12 @@ LOG = Path(__file__).with_name("schedules.jsonl")
 LONGEST = Path(__file__).with_name("run_up_records.jsonl")
 PERTURBED = Path(__file__).with_name("schedules_perturbed.jsonl")
 BOUNDS = Path(__file__).with_name("schedules_bounds.jsonl")
+CLIMBS = Path(__file__).with_name("run_up_climbs.jsonl")
 ROBOTS = "bhr", "g1_arms"
 RISE_M = 0.1  # of the jumps whose distance is a record
 PATIENCE_S = 40.0  # processor time for one plan
+FIRST_M = 0.5  # of a climb
+STEP_M = 0.25
 # name -> words of Contacts.named, or a target
 CASES = {
     "hop 0.1 m": "hop=0.1",
@@ -138,6 +141,46 @@ def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = RO
             except JumplabError as e:
                 row |= {"distance_m": None, "line": str(e)}
             log.add(row | {"cpu_s": round(time.process_time() - began, 1)})
+
+
+def climbs(path: Path = CLIMBS, robots: Iterable[str] = ROBOTS) -> None:
+    """Jumps with a rise of :data:`RISE_M`, each :data:`STEP_M` longer than the one before, from whose plan it begins,
+    until there is no plan: from a stand, and off one foot after a run-up of two steps; one row each, with the worlds in
+    which it stands.
+
+    ``python -m paper.schedules DIR climbs`` calls it.
+    """
+    stand = jl.JumpTask(FIRST_M, RISE_M)
+    asked = {"stand": stand, "run-up": replace(stand, takeoff="left", run_up=2)}
+    with logs.keep(path, itemgetter("robot", "from", "distance_m")) as log:
+        for robot, name in product(robots, asked):
+            if any(key[:2] == (robot, name) for key in log.done):
+                continue
+            planner = jl.Planner(robot)
+            plan = None
+            task = asked[name]
+            while True:
+                try:
+                    plan = planner.plan(task, "direct", near=plan)
+                except SolverError:
+                    break
+                runs = {world: jl.simulate(plan, **options) for world, options in WORLDS.items()}
+                row = {"robot": robot, "from": name, "distance_m": task.distance_m, "audit": plan.audit.passed}
+                row["speed_m_s"] = float(plan.com_velocity[plan.tape.flights[-1].start, 0])
+                log.add(row | {"stands": [x for x, run in runs.items() if run.landed and run.checks_passed]})
+                task = replace(task, distance_m=task.distance_m + STEP_M)
+
+
+def climbs_table(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line per robot and way to begin: the longest flight that is planned, and those that stand [m]."""
+    lines: dict[tuple, dict[str, Any]] = {}
+    for row in sorted(rows, key=itemgetter("distance_m")):
+        key = row["robot"], row["from"]
+        line = lines.setdefault(key, dict(zip(("robot", "from"), key, strict=True)))
+        for world in ["plan", *WORLDS]:
+            if row["audit"] if world == "plan" else world in row["stands"]:
+                line[f"{world} [m]"] = row["distance_m"]
+    return list(lines.values())
 
 
 def bounds(folder: str | Path, n: int = 10, path: Path = BOUNDS) -> None:
@@ -251,6 +294,8 @@ def speeds(plans: dict[str, JumpPlan]) -> Figure:
 if __name__ == "__main__":
     if sys.argv[2:] == ["records"]:
         records(sys.argv[1])
+    elif sys.argv[2:] == ["climbs"]:
+        climbs()
     elif sys.argv[2:] == ["bounds"]:
         bounds(sys.argv[1])
     elif sys.argv[2:]:

@@ -235,6 +235,13 @@ class Body:
         ]
 
     @cached_property
+    def trunk_boxes(self) -> list[Box]:
+        """Boxes of the bodies that neither end a limb nor are of a leg."""
+        legs = {body for foot in self.feet for body in self.chain(foot)} - {0}
+        inner = {b.parent for b in self.model.bodies} - legs
+        return [x for x in self.shapes if x.body in inner]
+
+    @cached_property
     def limb_points(self) -> list[Spot]:
         """Knees, and the far ends of the bodies that end a limb but are no feet."""
         points = [(body, np.zeros(3)) for body in self._shins]

@@ -42,6 +42,7 @@ from jumplab.stages.whole_body.terms import (
     swing_rows,
     torsion,
     touchdown_rows,
+    trunk_clearance,
 )
 from jumplab.stages.whole_body.tracking import following, tracking
 from jumplab.task import RANGES
@@ -201,6 +202,8 @@ class Schedule:
         terms += [link_distance(m, x, phases[k].intervals) for x in met]
         if self.sought and m.raised:
             terms.append(gentle_heels(m))
+        if self.sought and self.body.trunk_boxes:
+            terms.append(trunk_clearance(m))
         if last and self.sought:
             terms.append(largest(self.sought[0]))
         return terms

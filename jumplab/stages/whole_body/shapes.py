@@ -23,6 +23,11 @@ class Box:
     axes: np.ndarray  # (3, 3), columns
     half: np.ndarray  # (3,) half sizes [m]
 
+    def reach(self, s: SpatialState, way: ca.SX) -> ca.SX:
+        """From its middle as far as it goes along a unit vector ``way`` (3,) [m]."""
+        along = s.rotation(self.body) @ ca.DM(self.axes * self.half)
+        return sum(ca.sqrt(ca.dot(way, along[:, i]) ** 2 + ROUNDED_M**2) for i in range(3))
+
 
 @dataclass(frozen=True)
 class Pair:
@@ -52,9 +57,7 @@ class Pair:
         out = a.axes[:, axis] * (1 if self.face % 2 else -1)
         way = s.rotation(a.body) @ ca.DM(out)
         middle = s.point(b.body, b.centre) - s.point(a.body, a.centre)
-        along = s.rotation(b.body) @ ca.DM(b.axes * b.half)
-        spread = sum(ca.sqrt(ca.dot(way, along[:, i]) ** 2 + ROUNDED_M**2) for i in range(3))
-        return ca.dot(way, middle) - float(a.half[axis]) - spread
+        return ca.dot(way, middle) - float(a.half[axis]) - b.reach(s, way)
 
 
 @dataclass(frozen=True)

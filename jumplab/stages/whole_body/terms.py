@@ -285,6 +285,22 @@ def gentle_heels(m: Mode) -> Term:
     return limit(*words, lambda p: p.j[m.nv :], -most, most, scale=most)
 
 
+def trunk_clearance(m: Mode) -> Term:
+    """The trunk stays off the ground: effort, which else keeps it up, counts little beside a
+    record.
+    """
+    least = m.limits.body_clearance_m
+
+    def heights(p):
+        middles = [p.tree.point(x.body, x.centre) for x in m.body.trunk_boxes]
+        up = ca.DM([0, 0, 1])
+        boxes = zip(middles, m.body.trunk_boxes, strict=True)
+        return ca.vertcat(*(at[2] - p.ground(at, least) - x.reach(p.tree, up) for at, x in boxes))
+
+    words = "trunk clearance", "ours", "m", "node"
+    return limit(*words, heights, np.full(len(m.body.trunk_boxes), least), skip=(1, 0), **CLEAR)
+
+
 # feet on the ground
 # ---------------------------------------------------------------------------------------------
 def kept_rows(m: Mode, side: int, rows: ca.SX, yaw_and_roll: ca.SX) -> ca.SX:
