@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import product
@@ -28,12 +27,11 @@ from jumplab.studies import chain, trials
 from paper import logs
 
 LOG = Path(__file__).with_name("schedules.jsonl")
-LONGEST = Path(__file__).with_name("run_up_records.jsonl")
 PERTURBED = Path(__file__).with_name("schedules_perturbed.jsonl")
 BOUNDS = Path(__file__).with_name("schedules_bounds.jsonl")
 CLIMBS = Path(__file__).with_name("run_up_climbs.jsonl")
 ROBOTS = "bhr", "g1_arms"
-RISE_M = 0.1  # of the jumps whose distance is a record
+RISE_M = 0.1  # of jumps at a target, and of those that climb
 PATIENCE_S = 40.0  # processor time for one plan
 FIRST_M = 0.5  # of a climb
 STEP_M = 0.25
@@ -119,30 +117,6 @@ def perturbed(folder: str | Path, n: int = 30, path: Path = PERTURBED, robots: I
             log.add(row | {"causes": report.causes})
 
 
-def records(folder: str | Path, path: Path = LONGEST, robots: Iterable[str] = ROBOTS) -> None:
-    """The longest standing jump with a rise of :data:`RISE_M`, and the longest flights with it off one foot, from a
-    stand and after a run-up of two steps; one row each, plans kept in ``folder``.
-
-    ``python -m paper.schedules DIR records`` calls it.
-    """
-    stand = jl.JumpTask(0.0, RISE_M)
-    hop = replace(stand, takeoff="left")
-    asked = {"stand": stand, "hop": hop, "run-up": replace(hop, run_up=2)}
-    with logs.keep(path, itemgetter("robot", "from")) as log:
-        for robot, name in product(robots, asked):
-            if (robot, name) in log.done:
-                continue
-            began = time.process_time()
-            row: dict[str, Any] = {"robot": robot, "from": name}
-            try:
-                found = jl.record(robot, "distance_m", asked[name], engines=())
-                jl.save(Path(folder) / f"{robot} record {name}", found.plan)
-                row |= {"distance_m": found.value, "at_nodes_m": found.best, "line": found.line()}
-            except JumplabError as e:
-                row |= {"distance_m": None, "line": str(e)}
-            log.add(row | {"cpu_s": round(time.process_time() - began, 1)})
-
-
 def climbs(path: Path = CLIMBS, robots: Iterable[str] = ROBOTS) -> None:
     """Jumps with a rise of :data:`RISE_M`, each :data:`STEP_M` longer than the one before, from whose plan it begins,
     until there is no plan: from a stand, and off one foot after a run-up of two steps; one row each, with the worlds in
@@ -162,7 +136,7 @@ def climbs(path: Path = CLIMBS, robots: Iterable[str] = ROBOTS) -> None:
             while True:
                 try:
                     plan = planner.plan(task, "direct", near=plan)
-                except SolverError:
+                except JumplabError:
                     break
                 runs = {world: jl.simulate(plan, **options) for world, options in WORLDS.items()}
                 row = {"robot": robot, "from": name, "distance_m": task.distance_m, "audit": plan.audit.passed}
@@ -292,9 +266,7 @@ def speeds(plans: dict[str, JumpPlan]) -> Figure:
 
 
 if __name__ == "__main__":
-    if sys.argv[2:] == ["records"]:
-        records(sys.argv[1])
-    elif sys.argv[2:] == ["climbs"]:
+    if sys.argv[2:] == ["climbs"]:
         climbs()
     elif sys.argv[2:] == ["bounds"]:
         bounds(sys.argv[1])

@@ -364,10 +364,7 @@ class Contacts:
         gap = BEFORE_BLOCK * leg_length(robot)
         block = d + gap, d + gap + BLOCK_M, height_m
         landed = block[1] + gap + robot.foot.toe - robot.foot.heel
-        plain = cls.leap(robot, d, share=landed / d)
-        # the foot that follows goes over the block as the other one stands
-        phases = [replace(p, intervals=18) if len(p.modes) < 2 else p for p in plain.phases[-3:]]
-        return replace(plain, phases=(*plain.phases[:-3], *phases), over=block)
+        return replace(cls.leap(robot, d, share=landed / d), over=block)
 
     @classmethod
     def bound(cls, robot: Robot, jumps: int = 2, jump_m: float | None = None) -> Contacts:
