@@ -130,7 +130,7 @@ def climbs(path: Path = CLIMBS, robots: Iterable[str] = ROBOTS) -> None:
         for robot, name in product(robots, asked):
             if any(key[:2] == (robot, name) for key in log.done):
                 continue
-            planner = jl.Planner(robot)
+            planner = jl.Planner(Robot.load(robot))
             plan = None
             task = asked[name]
             while True:
