@@ -165,6 +165,6 @@ def test_what_is_no_change_is_refused(bhr, changes, words):
 def test_a_robot_that_falls_with_the_plain_plan_stands_with_the_robust_one(bhr, plans):
     from jumplab.studies.trials import TrialKey
 
-    drawn = Perturbation.draw(bhr, TrialKey(0, 3, "", "").robot_seed, ranges_at("com_m", 0.75))
+    drawn = Perturbation.draw(bhr, TrialKey(0, 2, "", "").robot_seed, ranges_at("com_m", 0.75))
     plain, found = (simulate_jump(plan.tape, bhr, perturbation=drawn, scene=Scene.flat()) for plan in plans)
     assert not plain.landed and found.landed and found.checks_passed

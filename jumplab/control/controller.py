@@ -44,6 +44,9 @@ SETTLING_S = 0.5
 SETTLING_STEPS = 4
 CALM_STEPS = 20
 OFTENER = 2  # times as often in flips: of 20 backflips in MuJoCo 19 stand, and 18 without
+# about the vertical, in the last flight: stage 1's landing lies in the sagittal plane, and leads a
+# robot that comes down turning so deep and so slowly that it falls
+TURNS_RAD = np.pi / 4
 # so long before the ground is due (a flip's legs still have to be stopped then) ...
 YIELD_S = 0.03
 FLIP_YIELD_S = 0.008
@@ -84,7 +87,7 @@ class Controller:
         stands on one foot: what is wrong there tips the robot.
     landing : "planned" follows stage 1's landing, planned in flight from the measured state;
         "spring" leads to the stance by spring-dampers alone, and so does "planned" where stage 1
-        finds no landing.
+        finds no landing, and after a flight that turns the robot by :data:`TURNS_RAD` or more.
     ground : its height [m] at a place [m] along the heading of the landing.
     hardware : what is known of drives and sensors.
     start_rad : heading in which the robot stands at the start, where the tape begins with zero.
@@ -145,7 +148,8 @@ class Controller:
         self.landing = LandingController(robot, may_step=step, force_noise_n=hardware.force_noise_n)
         flip = is_flip(tape)
         # a robot that stands on one foot does not fall onto the other
-        self.ahead = LandingAhead(robot, landing if flies else "spring")
+        straight = flies and _turned_rad(tape, self._gauge) < TURNS_RAD
+        self.ahead = LandingAhead(robot, landing if straight else "spring")
         self._reaim = Reaim(robot, tape, legs_alone=flip) if reaim and flies else None
         self._shifts = reaim and flip
         self._often = OFTENER if flip else 1
@@ -278,6 +282,12 @@ class Controller:
         if self.ahead.followed is None:  # ground came early
             self.landing.reference = self.ahead.plan(*state[:2], step * STEP_S, 0.0)
         return state
+
+
+def _turned_rad(tape: Tape, gauge: Gauge) -> float:
+    """Angle by which a tape turns the feet about the vertical in its last flight [rad]."""
+    headings = np.unwrap([gauge.heading(q) for q in tape.q[tape.flights[-1]]])
+    return float(abs(headings[-1] - headings[0]))
 
 
 def _looks_from_s(tape: Tape, awaited: np.ndarray) -> float:

@@ -86,9 +86,7 @@ class LandingSettings:
     w_jerk: float = 0.03  # [1], of the launch's weighted jerk: the catch has to be quick
     # [1 / (N m)^2 / s]; a quarter of the launch's, L must be gone soon
     w_momentum_rate: float = 5e-4
-    # [1 / (m/s^2)^2 / s] of the CoM: an even push. Seven times more, and the G1 sinks so deep after
-    # half turns that it falls; the peak force is the impact's and changes by less than 15 %
-    w_acceleration: float = 3e-3
+    w_acceleration: float = 2e-2  # [1 / (m/s^2)^2 / s] of the CoM: an even push, peak force low
     # [1 / m^2 / s] distance from the middle of the sole: a margin for the controller
     w_cop: float = 20.0
     # [1 / rad^2 / s] trunk against its pitch in the stance; ties L to the trunk's way back
