@@ -13,7 +13,9 @@ from jumplab.robot.stance import leg_length
 from jumplab.stages.whole_body import ContactPhase, Contacts, Limits, Mesh, Place, Weights
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import INTERVALS, STEP_SHARE, TIMES, jump_contacts
+from jumplab.stages.whole_body.ground import surface_of_schedule
 from jumplab.stages.whole_body.problem import Schedule
+from jumplab.task import JumpTask
 
 LEAP = "LR L lR R r - L LR"
 
@@ -276,8 +278,14 @@ def test_a_block_lies_ahead_on_level_ground(bhr):
     first, last, top = over.over
     step, sole = STEP_SHARE * leg_length(bhr), bhr.foot.toe - bhr.foot.heel
     assert top == 0.2 and step < first < last < over.places[-1].ahead_m - sole
+    for wrong in ((0.5, 0.4, 0.2), (0.4, 0.5), (0.4, np.nan, 0.2), (0.4, 0.5, np.inf), (0.4, 0.5, -0.1)):
+        with pytest.raises(InputError, match="over"):
+            replace(over, over=wrong)
     with pytest.raises(InputError, match=r"give \(from, to, top\) of a block"):
-        replace(over, over=(0.5, 0.4, 0.2))
+        Contacts.hurdle(bhr, -0.2)
+    under = replace(over, over=(last, last + 0.5, top))
+    with pytest.raises(InputError, match=r"foot would come down from .* on the block from .*; make its ahead_m at most"):
+        surface_of_schedule(Body(bhr), Limits(), under, JumpTask(0.0, 0.2))
     lower = tuple(replace(place, up_m=-0.1) for place in over.places[1:])
     with pytest.raises(InputError, match="a block lies on level ground"):
         replace(over, places=(*over.places[:1], *lower))

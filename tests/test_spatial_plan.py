@@ -220,6 +220,9 @@ def test_playback_lands_in_its_place_and_heading(task, engine, mode):
     assert np.hypot(m.foot_distance_m - task.distance_m, m.side_m - task.side_m) < 0.02
     assert abs(m.yaw_rad - task.yaw_rad) < np.radians(3)
     assert abs(m.com_rise_m - task.height_m) < 0.02
+    said = result.settings["landing"]
+    turned = "stage 1 knows no landing after a turn by 60 degrees"
+    assert (said["followed"], said["reason"]) == (("spring", turned) if task.yaw_rad else ("planned", None))
 
 
 @pytest.mark.slow

@@ -147,9 +147,12 @@ class Controller:
         self.forecast = Flight(robot, tape, ground) if flies else None
         self.landing = LandingController(robot, may_step=step, force_noise_n=hardware.force_noise_n)
         flip = is_flip(tape)
-        # a robot that stands on one foot does not fall onto the other
-        straight = flies and _turned_rad(tape, self._gauge) < TURNS_RAD
-        self.ahead = LandingAhead(robot, landing if straight else "spring")
+        hindrance = None
+        if not flies:
+            hindrance = "a robot that stands on one foot does not fall onto the other"
+        elif (turned := _turned_rad(tape, self._gauge)) >= TURNS_RAD:
+            hindrance = f"stage 1 knows no landing after a turn by {np.degrees(turned):.0f} degrees"
+        self.ahead = LandingAhead(robot, landing, hindrance)
         self._reaim = Reaim(robot, tape, legs_alone=flip) if reaim and flies else None
         self._shifts = reaim and flip
         self._often = OFTENER if flip else 1

@@ -31,16 +31,17 @@ class LandingAhead:
     """The landing to follow, and what became of it: planned in flight by stage 1 (``source``
     "planned"), or none, where spring-dampers lead to the stance ("spring").
 
-    ``followed`` is which of both really is, once decided.
+    ``followed`` is which of both really is, once decided. Nothing is planned where there is a
+    ``hindrance``, in words.
     """
 
-    def __init__(self, robot: Robot, source: str):
+    def __init__(self, robot: Robot, source: str, hindrance: str | None = None):
         self._robot = robot
         self._source = source
-        self.followed = None if source == "planned" else source
+        self.followed = None if source == "planned" and hindrance is None else "spring"
         names = "planned_at_s", "time_left_s", "solve_s", "in_time"
         self._planned: dict[str, float | None] = dict.fromkeys(names)
-        self._reason: str | None = None
+        self._reason = hindrance if source == "planned" else None
         if self.followed is None:
             try:  # now, so that the solve in flight is all that is left to do
                 landing_planner(robot)

@@ -356,9 +356,9 @@ class Contacts:
     @classmethod
     def hurdle(cls, robot: Robot, height_m: float = 0.0, step_m: float | None = None) -> Contacts:
         """A leap that goes farther, ``step_m`` [m] as there; over a block of ``height_m`` [m] in
-        the middle of it, if that is above 0.
+        the middle of it, if that is not 0.
         """
-        if height_m <= 0:
+        if height_m == 0:
             return cls.leap(robot, step_m, share=2.8)
         d = _step(robot, step_m)
         gap = BEFORE_BLOCK * leg_length(robot)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InfeasibleError
+from jumplab.errors import InfeasibleError, InputError
 from jumplab.robot import Robot
 from jumplab.stages.whole_body.body import Body
-from jumplab.stages.whole_body.contacts import Contacts
+from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.task import JumpTask
 
@@ -104,7 +104,8 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
     """The ground of a schedule, between its places on either height, or of the target that it is
     for [m].
 
-    Raises :class:`InfeasibleError` if no edge fits between them; the sentence names the phase.
+    Raises :class:`InfeasibleError` if no edge fits between them, and :class:`InputError` if a foot
+    would come down on the schedule's block; the sentence names the phase.
     """
     height, first = contacts.surface
     before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
@@ -117,12 +118,23 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
         before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
         after = [before[-1] + task.distance_m]
     toes = float(body.places[:, 0].mean())
+    length = 2 * body.half_m
     if contacts.over:
         first, last, top = contacts.over
+        stood = len(contacts.first)
+        for i, place in enumerate(contacts.places):
+            ends = place.ahead_m - length, place.ahead_m
+            if ends[0] < last and first < ends[1] and not contacts.is_aimed(stood + i):
+                phase, side = contacts.landings[stood + i]
+                raise InputError(
+                    f"phase {contacts.phases[phase].name!r}: the {SIDES[side]} foot would come "
+                    f"down from {ends[0]:.2f} to {ends[1]:.2f} m, on the block from {first:.2f} to "
+                    f"{last:.2f} m; make its ahead_m at most {first:.2f} m, or at least "
+                    f"{last + length:.2f} m"
+                )
         return Surface(over=(toes + first, toes + last, top))
     if height == 0:
         return Surface()
-    length = 2 * body.half_m
     leaving = toes + max(before)
     arriving = toes + min(after) - length
     room = 2 * limits.edge_before_heel_m
