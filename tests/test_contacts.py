@@ -284,7 +284,7 @@ def test_a_block_lies_ahead_on_level_ground(bhr):
     with pytest.raises(InputError, match=r"give \(from, to, top\) of a block"):
         Contacts.hurdle(bhr, -0.2)
     under = replace(over, over=(last, last + 0.5, top))
-    with pytest.raises(InputError, match=r"foot would come down from .* on the block from .*; make its ahead_m at most"):
+    with pytest.raises(InputError, match=r"foot would come down from .*, on the block from .*; make its ahead_m"):
         surface_of_schedule(Body(bhr), Limits(), under, JumpTask(0.0, 0.2))
     lower = tuple(replace(place, up_m=-0.1) for place in over.places[1:])
     with pytest.raises(InputError, match="a block lies on level ground"):
