@@ -1,6 +1,7 @@
 """Studies on file carry the code that made them; rows of another code are shown as old."""
 
 import json
+import re
 
 import pytest
 from paper import logs
@@ -30,6 +31,61 @@ def test_a_digest_changes_with_code_alone(tmp_path):
     assert found["as it is"] == found["the same"] and len(set(found.values())) == 3, found
     assert {file.split("/")[0] for file in logs.code()} == set(logs.ROOMS)
     assert {"stages/planner.py", "auditing/limits.toml"} <= set(logs.code())
+
+
+LOCALS = """
+def f(x, most=1):
+    total = x * 2
+
+    def g(y):
+        part = total + y.size
+        return [part for part in range(part) if part < most]
+
+    while more := g(x):
+        total += sum(more)
+    return (lambda z: z + total)(x)
+"""
+SHARED = """
+def f():
+    total = 0
+
+    def g():
+        nonlocal total
+        global count
+        total += 1
+        count = total
+
+    return g
+"""
+SAME_LOCALS = [
+    (r"total", "amount"),
+    (r"part", "more"),
+    (r"more", "part"),
+    (r"part for part in range\(part\) if part", "k for k in range(part) if k"),
+]
+OTHER_CODE = {
+    "a constant": (r"2", "3"),
+    "an operator": (r"\*", "+"),
+    "an attribute": (r"size", "ndim"),
+    "an argument": (r"most", "largest"),
+    "a lambda's argument": (r"z", "w"),
+    "a global": (r"sum", "max"),
+    "another local": (r"z \+ total", "z + more"),
+    "a local, now a global": (r"part\)", "parts)"),
+    "another scope's variable": (r"range\(part\)", "range(total)"),
+}
+
+
+def test_names_of_locals_do_not_count(tmp_path):
+    def digest(code):
+        (tmp_path / "a.py").write_text(code)
+        return logs.digest(tmp_path / "a.py")
+
+    renamed = {digest(re.sub(rf"\b{old}", new, LOCALS)) for old, new in SAME_LOCALS}
+    assert renamed == {digest(LOCALS)}
+    others = [digest(re.sub(old, new, LOCALS)) for old, new in OTHER_CODE.values()]
+    assert len({digest(LOCALS), *others}) == len(OTHER_CODE) + 1, dict(zip(OTHER_CODE, others, strict=True))
+    assert digest(SHARED.replace("count", "number")) != digest(SHARED)
 
 
 def test_rows_of_other_code_are_told(tmp_path, now, bhr):

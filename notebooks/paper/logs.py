@@ -8,10 +8,11 @@ import json
 import os
 import platform
 import tomllib
-from collections import Counter
+from collections import ChainMap, Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,8 +34,8 @@ NAMED = 3  # changed files in a line
 
 @cache
 def code() -> dict[str, str]:
-    """File of the library, ``sub-package/name.py`` -> digest of what it does: comments, docstrings and layout do not
-    count.
+    """File of the library, ``sub-package/name.py`` -> digest of what it does: comments, docstrings, layout and names of
+    local variables do not count.
     """
     root = Path(jumplab.__file__).parent
     files = sorted(p for room in ROOMS for p in (root / room).rglob("*") if p.suffix in (".py", ".toml"))
@@ -42,24 +43,93 @@ def code() -> dict[str, str]:
 
 
 def digest(path: Path) -> str:
-    """Eight digits that change with the code of a Python file, or with the values of a TOML file."""
+    """Eight digits that change with the code of a Python file, or with the values of a TOML file.
+
+    Comments, docstrings and names of local variables may change; names of arguments may not: calls can have them.
+    """
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".toml":
         parts = repr(tomllib.loads(text))
     else:
-        parts = ast.dump(_Bare().visit(ast.parse(text)))
+        tree = ast.parse(text)
+        _leave_docstrings_out(tree)
+        _Numbers().visit(tree)
+        parts = ast.dump(tree)
     return hashlib.sha256(parts.encode()).hexdigest()[:8]
 
 
-class _Bare(ast.NodeTransformer):
-    """Leaves docstrings out."""
-
-    def generic_visit(self, node: ast.AST) -> ast.AST:
+def _leave_docstrings_out(tree: ast.AST) -> None:
+    for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
             if isinstance(getattr(body[0].value, "value", None), str):
-                node.body = body[1:]
-        return super().generic_visit(node)
+                del body[0]
+
+
+class _Numbers(ast.NodeVisitor):
+    """Puts numbers in place of names of local variables, in each scope in the order of their first appearance."""
+
+    def __init__(self):
+        self.names = ChainMap()  # name -> number, or the name where it stays; a map for each scope, the inner first
+        self.numbers = count()
+
+    def visit_Name(self, node: ast.Name) -> None:
+        node.id = self.names.get(node.id, node.id)
+
+    def visit_FunctionDef(self, node: ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) -> None:
+        body = node.body if isinstance(node.body, list) else [node.body]
+        for part in ast.iter_child_nodes(node):  # decorators, defaults, annotations: of the scope around it
+            if part not in body:
+                self.visit(part)
+        stay = {part.arg for part in ast.iter_child_nodes(node.args) if isinstance(part, ast.arg)}
+        self._enter(body, stay | _more_than_variables(body))
+        for part in body:
+            self.visit(part)
+        self._leave()
+
+    visit_AsyncFunctionDef = visit_Lambda = visit_FunctionDef
+
+    def visit_ListComp(self, node: ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp) -> None:
+        first = node.generators[0]
+        around = first.iter  # of the scope around it
+        self.visit(around)
+        first.iter = None
+        self._enter([part.target for part in node.generators])
+        self.generic_visit(node)
+        self._leave()
+        first.iter = around
+
+    visit_SetComp = visit_DictComp = visit_GeneratorExp = visit_ListComp
+
+    def _enter(self, parts: list[ast.AST], stay: Iterable[str] = ()) -> None:
+        bound = dict.fromkeys(name for part in parts for name in _bound(part))
+        self.names = self.names.new_child({name: next(self.numbers) for name in bound} | {name: name for name in stay})
+
+    def _leave(self) -> None:
+        self.names = self.names.parents
+
+
+def _bound(part: ast.AST) -> Iterator[str]:
+    """Variables that a part of a scope binds, without those of scopes inside it."""
+    if isinstance(part, ast.Name) and not isinstance(part.ctx, ast.Load):
+        yield part.id
+    if not isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.ClassDef):
+        inner = [part.iter, *part.ifs] if isinstance(part, ast.comprehension) else ast.iter_child_nodes(part)
+        for child in inner:
+            yield from _bound(child)
+
+
+def _more_than_variables(body: list[ast.AST]) -> set[str]:
+    """Names inside a function that are global, nonlocal, of functions, classes, their attributes, modules or errors."""
+    stay = set()
+    for part in (part for line in body for part in ast.walk(line)):
+        if isinstance(part, ast.Global | ast.Nonlocal):
+            stay.update(part.names)
+        elif isinstance(part, ast.ClassDef):
+            stay.update(name for line in part.body for name in _bound(line))
+        other = (getattr(part, field, None) for field in ("asname", "name", "rest"))
+        stay.update(name.split(".")[0] for name in other if name)
+    return stay
 
 
 def stamp(folder: str | Path | None = None, robot: Robot | None = None) -> Row:
