@@ -127,17 +127,17 @@ def plan(
                 "give only one of contacts and like, and leave out method, robust and starts"
             )
         with patience(patience_s):
-            made = _followed(task, robot, contacts, like, changes)
+            jump = _followed(task, robot, contacts, like, changes)
     else:
         if robust is not None:
             from jumplab.studies.robust import robust_changes
 
             changes = robust_changes(task, robot, robust, changes)
         planner = Planner(robot, keep=True, **changes)
-        made = plan_or_advise(planner, task, method, patience_s, starts)
-    if not made.audit.sound:
-        warnings.warn(f"the plan is returned although it has faults: {made.verdict}", stacklevel=3)
-    return made
+        jump = plan_or_advise(planner, task, method, patience_s, starts)
+    if not jump.audit.sound:
+        warnings.warn(f"the plan is returned although it has faults: {jump.verdict}", stacklevel=3)
+    return jump
 
 
 def _followed(
@@ -227,8 +227,8 @@ def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None
     """
     from jumplab.auditing import write_audit
 
-    told = {**plan.summary, "audit": plan.audit.line()}
-    report = folders.write_plan(folder, plan.tape, plan.robot, told, complete=write_audit)
+    summary = {**plan.summary, "audit": plan.audit.line()}
+    report = folders.write_plan(folder, plan.tape, plan.robot, summary, complete=write_audit)
     if run is not None:
         folders.write_simulation(folder, run, folders.read_plan(folder)[2])
     return report
@@ -258,11 +258,11 @@ def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
     from jumplab.sim import Scene
 
     scene = Scene.of_plan(plan.summary, plan.robot)
-    made = page(plan.robot, plan=plan.tape, simulation=run, task=plan.task, scene=scene)
+    jump_page = page(plan.robot, plan=plan.tape, simulation=run, task=plan.task, scene=scene)
     if _in_script():
         place = cache.folder() or Path(tempfile.mkdtemp(prefix="jumplab-"))
-        print(f"the jump in 3-D, for any browser: {made.save(place / 'jump.html')}")
-    return made
+        print(f"the jump in 3-D, for any browser: {jump_page.save(place / 'jump.html')}")
+    return jump_page
 
 
 def _in_script() -> bool:

@@ -177,8 +177,8 @@ def _judged(clip: Clip) -> ClipReport:
         ],
         "versions": versions(),
     }
-    found = {"clip": clip, "tape": tape, "ground": ground, "still": still}
-    report = ClipReport(checks, manifest, **found, series=_series(r))
+    fields = {"clip": clip, "tape": tape, "ground": ground, "still": still}
+    report = ClipReport(checks, manifest, **fields, series=_series(r))
     manifest["phases"] = [list(phase) for phase in report.phases]
     return report
 
@@ -343,8 +343,8 @@ def _measures(
     yield "feet in the ground", depth, t, feet
     near = standing & (height - level < METHOD.near_m)
     yield "feet on the ground slide", *_most(_sliding(r, near), t, METHOD.slide_percent), feet
-    off = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
-    yield "flights fall freely", off, [times[0] for times, _, _ in falls]
+    deviations = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
+    yield "flights fall freely", deviations, [times[0] for times, _, _ in falls]
     missing = norm(r.base_residual[:, :3]) / r.weight
     yield "unphysical force", *_most(missing, t, METHOD.force_percent)
     moment = norm(r.base_residual[:, 3:]) / r.weight

@@ -106,11 +106,11 @@ def collisions(r: Replay) -> Iterator[Measure]:
         geometry.addCollisionPair(pin.CollisionPair(*pair))
     rows = np.unique([*range(0, len(r.tape.t), METHOD.collision_step), len(r.tape.t) - 1])
     data = r.model.createData()
-    found = geometry.createData()
+    geometry_data = geometry.createData()
     gaps = []
     for q in r.tape.q[rows]:
-        pin.computeDistances(r.model, data, geometry, found, q)
-        gaps.append([d.min_distance for d in found.distanceResults])
+        pin.computeDistances(r.model, data, geometry, geometry_data, q)
+        gaps.append([d.min_distance for d in geometry_data.distanceResults])
     names = [shape.name for shape in geometry.geometryObjects]
     pairs = [f"{names[i]} - {names[k]}" for i, k in inner + outer]
     inside, outside = np.split(np.array(gaps), [len(inner)], axis=1)

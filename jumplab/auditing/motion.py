@@ -213,9 +213,9 @@ def _flown(r: Replay, task: JumpTask) -> Iterator[Measure]:
     stood first, against those that leave.
     """
     t = r.tape.t
-    off = r.flights[-1].start
-    ahead = r.toe_corners[[off, -1], ..., 0].mean(axis=-1) - r.toe_corners[0, ..., 0].mean(axis=-1)
-    flown = ahead[1] - ahead[0, r.carrying[off - 1]].mean()
+    row = r.flights[-1].start
+    ahead = r.toe_corners[[row, -1], ..., 0].mean(axis=-1) - r.toe_corners[0, ..., 0].mean(axis=-1)
+    flown = ahead[1] - ahead[0, r.carrying[row - 1]].mean()
     numbers = {"found": flown.mean(), "asked": task.distance_m}
     yield "distance", np.abs(flown - task.distance_m)[None], t[-1:], r.tape.contact_frames, numbers
     yield from _risen(r, task, r.flights[-1])

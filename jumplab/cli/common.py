@@ -113,8 +113,8 @@ def declare(
         one = below.add_parser(name, help=help_, description=text, epilog=example)
         one.set_defaults(work=work)
         shared = {usage: OPTIONS["shared"][usage] for usage in options.pop("shared", ())}
-        for usage, how in (shared | options).items():
-            add_option(one, usage, **how)
+        for usage, settings in (shared | options).items():
+            add_option(one, usage, **settings)
         add_common(one)
     return below.choices
 
@@ -123,8 +123,8 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     """Add the options of every command; without defaults, which would undo them where they stand
     before COMMAND.
     """
-    for usage, how in OPTIONS["every"].items():
-        add_option(parser, usage, default=argparse.SUPPRESS, **how)
+    for usage, settings in OPTIONS["every"].items():
+        add_option(parser, usage, default=argparse.SUPPRESS, **settings)
 
 
 def add_option(

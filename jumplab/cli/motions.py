@@ -25,8 +25,8 @@ NEAR = 0.12
 def judge(args: Namespace) -> None:
     """Judge motion clips: find motions that no robot could do."""
     given = {"fps": args.fps, "order": args.order, "platform_m": args.platform_m}
-    found = jl.judge(args.file, args.robot, **given)
-    reports = found if isinstance(found, list) else [found]
+    result = jl.judge(args.file, args.robot, **given)
+    reports = result if isinstance(result, list) else [result]
     passed = sum(report.passed for report in reports)
     rows = [report.row() for report in reports]
     failed = Counter(check.name for report in reports for check in report.failed)
@@ -65,10 +65,10 @@ def _better_rate(report: Any) -> int | None:
     return rate if there and OTHER[0] < ratio < OTHER[1] else None
 
 
-def _write(folder: str, reports: list[Any], found: dict[str, Any]) -> None:
+def _write(folder: str, reports: list[Any], summary: dict[str, Any]) -> None:
     """The reports as JSON, and of each clip a page in 3-D."""
     with io.folder.transaction(folder) as staging:
-        (staging / REPORT).write_text(io.folder.to_json(found), encoding="utf-8")
+        (staging / REPORT).write_text(io.folder.to_json(summary), encoding="utf-8")
         for report in reports:
             title = report.line()
             page = jl.plots.page(report.clip.robot, plan=report.tape, title=title)

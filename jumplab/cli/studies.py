@@ -172,31 +172,31 @@ def record(args: Namespace) -> None:
     numbers = {name: getattr(args, name) for name in TARGET if getattr(args, name) is not None}
     task = JumpTask(**{"distance_m": 0.0, "height_m": 0.2} | numbers) if numbers else None
     options = given(studies.record.record, args, given=task)
-    found = studies.record.record(**options)
-    limits = [asdict(x) for x in found.limits]
-    told = {name: getattr(found, name) for name in ("what", "value", "unit", "bound", "found")}
-    landed = {name: run.landed for name, run in found.runs.items()}
-    args.found["record"] = told | {"limits": limits, "landed": landed}
-    print(found.line())
-    print(f"audit: {found.audit.line()}")
-    for name, run in found.runs.items():
-        print(f"at {found.share:.0%} of it in {name}: {run.line()}")
+    best = studies.record.record(**options)
+    limits = [asdict(x) for x in best.limits]
+    summary = {name: getattr(best, name) for name in ("what", "value", "unit", "bound", "found")}
+    landed = {name: run.landed for name, run in best.runs.items()}
+    args.found["record"] = summary | {"limits": limits, "landed": landed}
+    print(best.line())
+    print(f"audit: {best.audit.line()}")
+    for name, run in best.runs.items():
+        print(f"at {best.share:.0%} of it in {name}: {run.line()}")
     columns = ("limit", "joint", "phase", "from_s", "to_s", "worth")
     print(jl.plots.table(limits, columns, digits=3))
     if args.prices:
-        prices = found.prices()
+        prices = best.prices()
         args.found["prices"] = [asdict(row) | {"gap": row.gap} for row in prices.rows]
         print(jl.plots.table(args.found["prices"], digits=3))
         print(prices.line())
     if args.improve:
-        better = found.improve({"gear": args.improve.split(",")})
+        better = best.improve({"gear": args.improve.split(",")})
         changes = [asdict(x) for x in better.changes]
         args.found["improved"] = {"changes": changes, "value": better.after.value}
         print(better.line())
         print(jl.plots.table(changes, digits=3))
-        found = better.after
+        best = better.after
     if args.out:
-        jl.save(args.out, found.plan)
+        jl.save(args.out, best.plan)
         print(f"the plan at the record is in {args.out}")
 
 

@@ -124,9 +124,9 @@ class _Arrays(NumpyUnpickler):
 
     def load_build(self) -> None:
         """As joblib's, but arrays of objects, whose content it would unpickle freely."""
-        made, state = self.stack[-2:]
-        said = state if isinstance(state, Mapping) else {}
-        if isinstance(made, NumpyArrayWrapper) and getattr(said.get("dtype"), "hasobject", True):
+        built, state = self.stack[-2:]
+        values = state if isinstance(state, Mapping) else {}
+        if isinstance(built, NumpyArrayWrapper) and getattr(values.get("dtype"), "hasobject", True):
             raise pickle.UnpicklingError("it holds an array of objects, which could run code")
         super().load_build()
 
@@ -140,8 +140,8 @@ def _content(path: Path) -> Mapping[str, Any]:
         if not raw.strip():
             raise InputError(f"{path}: is empty; give a pickle, npz or csv file")
         if raw[:2] == b"PK":
-            found = read_tensors(raw)
-            return reading.arrays(raw) if found is None else found
+            tensors = read_tensors(raw)
+            return reading.arrays(raw) if tensors is None else tensors
         if raw[:1] == b"\x80":
             return _Arrays(str(path), io.BytesIO(raw), ensure_native_byte_order=True).load()
         return _columns(raw.decode())
@@ -288,7 +288,7 @@ def read_clips(
     if fps is not None and not FPS[0] <= fps <= FPS[1]:
         raise InputError(f"fps = {fps:g} must lie between {FPS[0]:g} and {FPS[1]:g}")
     content = _content(path)
-    found = []
+    clips = []
     for name, x, form in _entries(content, path.stem):
         where = f"{path}" if name == path.stem else f"{path}, clip {name!r}"
         try:
@@ -298,12 +298,12 @@ def read_clips(
             raw = replace(raw, fps=_rate(x), names=names, **_numbers(raw))
         except (KeyError, IndexError, TypeError, ValueError) as e:
             raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
-        found.append(_clip(where, name, raw, robot, fps, order))
-    if not found:
+        clips.append(_clip(where, name, raw, robot, fps, order))
+    if not clips:
         keys = list(content)[:6] if isinstance(content, Mapping) else quoted(content)
         known = "; ".join(map(", ".join, FORMS))
         raise InputError(f"{path}: holds no clip, but {keys}; a clip has one of: {known}")
-    return found if len(found) > 1 else [replace(found[0], name=path.stem)]
+    return clips if len(clips) > 1 else [replace(clips[0], name=path.stem)]
 
 
 # checks
@@ -472,11 +472,11 @@ def _check_joints(where: str, robot: Robot, q: np.ndarray) -> None:
     """Refuse joints that are out of their ranges most of the time: another order, or robot."""
     limits = robot.limits
     beyond = np.maximum(limits.lower - q[:, 7:], q[:, 7:] - limits.upper)
-    off = np.median(beyond, axis=0)
-    worst = int(off.argmax())
-    if off[worst] > BEYOND_RAD:
+    excess = np.median(beyond, axis=0)
+    worst = int(excess.argmax())
+    if excess[worst] > BEYOND_RAD:
         raise InputError(
-            f"{where}: joint {robot.joint_names[worst]!r} is {off[worst]:.1f} rad beyond its range "
-            f"most of the time: its joints are in another order, or the clip is of another robot; "
-            f"correct the order, or pass that robot"
+            f"{where}: joint {robot.joint_names[worst]!r} is {excess[worst]:.1f} rad beyond its "
+            f"range most of the time: its joints are in another order, or the clip is of another "
+            f"robot; correct the order, or pass that robot"
         )

@@ -366,11 +366,11 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     for name in whole.joints:
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         joint = spec.joint(name)
-        if own := whole.robot.actuators.get(name):
-            joint.actfrcrange = [-own["effort"], own["effort"]]
-            joint.armature = own["armature"]
-            joint.frictionloss = own["friction"]
-            joint.damping = [own["damping"], 0.0, 0.0]  # of a polynomial in the rate
+        if actuator := whole.robot.actuators.get(name):
+            joint.actfrcrange = [-actuator["effort"], actuator["effort"]]
+            joint.armature = actuator["armature"]
+            joint.frictionloss = actuator["friction"]
+            joint.damping = [actuator["damping"], 0.0, 0.0]  # of a polynomial in the rate
         motor.ctrlrange = joint.actfrcrange
     spec.compile()
     qpos, qvel = _qpos_qvel(x)

@@ -119,9 +119,9 @@ class Dynamics:
         for (*at, rows), turn, j in zip(held, turns, jacobians, strict=True):
             parts = pin.getFrameAccelerationDerivatives(model, data, *at, pin.LOCAL)
             v_q, a_q, a_v, _ = (part[rows] for part in parts)
-            off = j.copy()
-            off[:3] -= turn.T @ np.mean(ways, axis=0)
-            by_place = -a_q - DAMPING * v_q - STIFFNESS * off
+            error_q = j.copy()
+            error_q[:3] -= turn.T @ np.mean(ways, axis=0)
+            by_place = -a_q - DAMPING * v_q - STIFFNESS * error_q
             right.append(np.hstack([by_place, -a_v - DAMPING * j, np.zeros((len(rows), nv - 6))]))
         out = self.solved(jacobians, np.vstack(right))[:nv]
         return out[:, : 2 * nv], out[:, 2 * nv :]

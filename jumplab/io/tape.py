@@ -66,9 +66,9 @@ class Tape(Shown):
         A tape that does not say stands on all feet until take-off, on the toes from
         ``toe_phase_start`` on.
         """
-        said = self.extra.get("contacts")
-        if np.shape(said) == self.f.shape[:2]:
-            return said
+        stored = self.extra.get("contacts")
+        if np.shape(stored) == self.f.shape[:2]:
+            return stored
         toes = self.t >= self.extra.get("toe_phase_start", np.inf)
         codes = np.where(self.phase == "flight", AIR, np.where(toes, TOE, FLAT))
         return np.repeat(codes[:, None], len(self.contact_frames), axis=1)
@@ -104,8 +104,8 @@ class Tape(Shown):
         """The tape up to a ``row`` (of N), which it does not have any more."""
         rows = self.arrays().items()
         cut = {k: x[:row] for k, x in rows if np.shape(x)[:1] == self.t.shape}
-        own = {k: x for k, x in cut.items() if k in _DIMENSIONS}
-        return replace(self, **own, extra={k: cut.get(k, x) for k, x in self.extra.items()})
+        fields = {k: x for k, x in cut.items() if k in _DIMENSIONS}
+        return replace(self, **fields, extra={k: cut.get(k, x) for k, x in self.extra.items()})
 
     @property
     def takeoff_index(self) -> int:
@@ -119,8 +119,8 @@ class Tape(Shown):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays under the names of ``plan.npz``."""
-        own = {name: getattr(self, name) for name in _DIMENSIONS}
-        return {"schema": np.array(SCHEMA), **own, **self.extra}
+        fields = {name: getattr(self, name) for name in _DIMENSIONS}
+        return {"schema": np.array(SCHEMA), **fields, **self.extra}
 
     def save(self, path: str | Path) -> None:
         """Write ``plan.npz`` (compressed, no pickle)."""
@@ -159,5 +159,5 @@ class Tape(Shown):
         for name in _DIMENSIONS:
             if name not in data:
                 raise InputError(f"{path}: the array {name!r} is missing; plan the jump again")
-        own = {name: data.pop(name) for name in _DIMENSIONS}
-        return cls(**own, extra=data)
+        fields = {name: data.pop(name) for name in _DIMENSIONS}
+        return cls(**fields, extra=data)

@@ -71,9 +71,9 @@ class Whole:
     @property
     def feet(self) -> list[tuple[str, pin.SE3]]:
         """Of each foot the joint that moves it, and the place of its link in that joint's axes."""
-        own = self.robot.model
-        frames = [own.frames[own.getFrameId(name, pin.BODY)] for name in self.robot.foot.frames]
-        return [(own.names[frame.parentJoint], frame.placement) for frame in frames]
+        model = self.robot.model
+        frames = [model.frames[model.getFrameId(name, pin.BODY)] for name in self.robot.foot.frames]
+        return [(model.names[frame.parentJoint], frame.placement) for frame in frames]
 
     def states(self, x: Motion) -> tuple[np.ndarray, np.ndarray]:
         """Configurations (F, nq) and velocities (F, nv) of :meth:`frames` in Pinocchio's order."""
@@ -167,11 +167,11 @@ class Whole:
         }
         return np.hstack([places, state[:, 7 + self._jumping]]), moved
 
-    def _check_places(self, q: np.ndarray, own: np.ndarray) -> None:
+    def _check_places(self, q: np.ndarray, q_robot: np.ndarray) -> None:
         """The joints of the two robots are in the same places, but for what was evened out."""
         names = self.robot.joint_names
         both = []
-        for model, state in ((self.model, q), (self.robot.model, own)):
+        for model, state in ((self.model, q), (self.robot.model, q_robot)):
             data = model.createData()
             pin.forwardKinematics(model, data, state)
             both.append([data.oMi[model.getJointId(name)].translation for name in names])

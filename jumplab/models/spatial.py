@@ -87,11 +87,11 @@ class SpatialModel:
         frames = {0: np.eye(3)}
         self.bodies = []
         for j in range(1, model.njoints):
-            axis, own = (1, np.eye(3)) if j == 1 else self._joint(data, j)
-            frames[j] = own
+            axis, axes = (1, np.eye(3)) if j == 1 else self._joint(data, j)
+            frames[j] = axes
             above = frames[model.parents[j]]
             placement = model.jointPlacements[j]
-            inertia = pin.SE3(own.T, np.zeros(3)).act(model.inertias[j])
+            inertia = pin.SE3(axes.T, np.zeros(3)).act(model.inertias[j])
             lever = pin.skew(inertia.lever)
             second = inertia.inertia - inertia.mass * lever @ lever
             self.bodies.append(
@@ -99,9 +99,9 @@ class SpatialModel:
                     model.names[j],
                     max(0, model.parents[j] - 1),
                     axis,
-                    _clean(above.T @ placement.rotation @ own),
+                    _clean(above.T @ placement.rotation @ axes),
                     _clean(above.T @ placement.translation),
-                    own,
+                    axes,
                     inertia.mass,
                     _clean(inertia.mass * inertia.lever),
                     _clean(second),
@@ -500,10 +500,10 @@ class SpatialState:
             b = self.model.bodies[k]
             turn, place = self._frames[k]
             first = turn @ ca.DM(b.first)
-            own = turn @ ca.DM(b.second) @ turn.T + b.mass * _spread(place, place)
-            own += _spread(place, first) + _spread(first, place)
+            inertia = turn @ ca.DM(b.second) @ turn.T + b.mass * _spread(place, place)
+            inertia += _spread(place, first) + _spread(first, place)
             beside = self._even and self.model.across[k] is None
-            total += own * WITH_MIRROR_IMAGE if beside else own
+            total += inertia * WITH_MIRROR_IMAGE if beside else inertia
         return total
 
     @property

@@ -93,7 +93,7 @@ class Assembled:
             nodes, index = part.on(self.layouts)
             n = len(nodes)
             number = self._number(part, functions, nodes)
-            own = weights[weight : weight + len(part.costs)]
+            part_weights = weights[weight : weight + len(part.costs)]
             weight += len(part.costs)
             local = ca.reshape(x[index.ravel().tolist()], -1, n)
             given = ca.MX(0, n)
@@ -101,7 +101,7 @@ class Assembled:
                 step = ca.DM.ones(1, n) / self.layouts[part.owner].phase.intervals
                 given = ca.vertcat(data[part.owner][:, nodes.tolist()], step)
             inputs = (local, given, ca.repmat(parameters, 1, n))
-            yield Block(part, functions, index, number, inputs, ca.repmat(own, 1, n))
+            yield Block(part, functions, index, number, inputs, ca.repmat(part_weights, 1, n))
 
     def _number(self, part: Part, functions: dict[str, ca.Function], nodes) -> np.ndarray:
         """Numbers (n, count) of the rows of a part at ``nodes`` (n,), -1 where one is left out."""
@@ -223,8 +223,8 @@ class Block:
 
         The last one of ``lam_g`` (n_rows + 1,) is that of rows that are left out.
         """
-        own = lam_g[self.number.ravel().tolist()]
-        lam = ca.reshape(own, self.number.shape[1], len(self.index))
+        multipliers = lam_g[self.number.ravel().tolist()]
+        lam = ca.reshape(multipliers, self.number.shape[1], len(self.index))
         return self.upper("hessian", self.weights, lam, ca.repmat(lam_f, 1, len(self.index)))
 
     def upper(self, name: str, *more: ca.MX) -> tuple:

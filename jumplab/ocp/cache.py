@@ -114,14 +114,14 @@ def remembered(words: list, key: str, make: Callable[[], Any]) -> Any:
             return json.loads(body)
     except (OSError, ValueError, InputError):
         pass
-    made = make()
-    body = json.dumps(made).encode()
+    data = make()
+    body = json.dumps(data).encode()
     # a folder that cannot be written, or that others can write, is no reason to fail
     with suppress(OSError, InputError):
         reading.require_private(place, place.lstat())
         content = hashlib.sha256(body).hexdigest().encode() + b"\n" + body
         write_file(path, content, mode=0o600)
-    return made
+    return data
 
 
 def functions(
@@ -143,13 +143,13 @@ def functions(
         words = part.words(problem)
         digest = fingerprint(words, key or "")
         if digest not in known:
-            known[digest] = _made(formulator, part, words, key)
+            known[digest] = _functions_of(formulator, part, words, key)
         out.append(known[digest])
     return out
 
 
-def _made(formulator: Formulator, part: Part, words: list, key: str | None) -> dict:
-    """The functions of a part, made or read."""
+def _functions_of(formulator: Formulator, part: Part, words: list, key: str | None) -> dict:
+    """The functions of a part, from the cache or built."""
     if key is None:
         return formulator.formulas(part).functions()
 

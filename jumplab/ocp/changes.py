@@ -72,14 +72,14 @@ def changed(
 
     def kept(owner: str, items: tuple) -> tuple:
         """Those that are not left out, with the weights that are asked for."""
-        found = []
+        remaining = []
         for x in items:
             place = owner, x.name
             if place in asked:
                 x = replace(x, weight=asked[place])
             if not (is_named(owner, x, off) or (place in problem.own and x.weight == 0)):
-                found.append(x)
-        return tuple(found)
+                remaining.append(x)
+        return tuple(remaining)
 
     phases = tuple(
         replace(p, terms=kept(p.name, p.terms), bounds=kept(p.name, p.bounds))
@@ -123,8 +123,8 @@ def _with(problem: Problem, owner: str, term: Term, look: Callable) -> Problem:
         replace(p, terms=(*p.terms, term)) if p.name == owner else p for p in problem.phases
     )
     joints = (*problem.joints, term) if joining else problem.joints
-    own = {**problem.own, (owner, term.name): look(problem, owner, term, who)}
-    return replace(problem, phases=phases, joints=joints, own=own)
+    digests = {**problem.own, (owner, term.name): look(problem, owner, term, who)}
+    return replace(problem, phases=phases, joints=joints, own=digests)
 
 
 def _digest(problem: Problem, owner: str, term: Term, who: str) -> str:
@@ -132,16 +132,16 @@ def _digest(problem: Problem, owner: str, term: Term, who: str) -> str:
     place = "interval" if term.at == "mid" else term.at
     f = Formulator(problem).formulas(Part(owner, place, (term,)))
     columns = [y for _, y in f.costs] + f.rows
-    made = ca.Function("own", [f.local, f.data, f.parameters], columns, {"allow_free": True})
-    if made.has_free():
-        free = ", ".join(made.get_free()[:3])
+    function = ca.Function("own", [f.local, f.data, f.parameters], columns, {"allow_free": True})
+    if function.has_free():
+        free = ", ".join(function.get_free()[:3])
         raise InputError(
             f"{who}: it uses symbols from outside its point ({free}); use only those of its point"
         )
     # bounds that are functions are read when solving
     if not (term.is_cost or callable(term.lower) or callable(term.upper)):
         ends(who, term, columns[0].numel())
-    return hashlib.sha256(made.serialize().encode()).hexdigest()
+    return hashlib.sha256(function.serialize().encode()).hexdigest()
 
 
 def ends(who: str, term: Term, rows: int) -> tuple[np.ndarray, np.ndarray]:

@@ -64,9 +64,11 @@ def check_start(a: Assembled, posed: Posed) -> None:
     if all(np.all(np.isfinite(np.array(value.nonzeros()))) for value in values):
         return
     lost = _without_number(a, x, p)
-    own = [(owner, name) for owner, name in a.problem.own if f"{owner}/{name}" in lost or not lost]
-    if own:
-        who = " or ".join(f"{name!r} of {a.problem.place(owner)!r}" for owner, name in own)
+    singular = [
+        (owner, name) for owner, name in a.problem.own if f"{owner}/{name}" in lost or not lost
+    ]
+    if singular:
+        who = " or ".join(f"{name!r} of {a.problem.place(owner)!r}" for owner, name in singular)
         raise InputError(
             f"term {who}: no finite value or derivative at the start of the solve; keep the "
             "arguments of its functions away from where they are singular, as in sqrt(x + 1e-6)"
@@ -156,5 +158,5 @@ def _least_violation(a: Assembled, posed: Posed, seconds: float) -> tuple[np.nda
     }
     options = ELASTIC | {"max_cpu_time": min(ELASTIC["max_cpu_time"], seconds)}
     answer = ipopt(functions, options)(**arguments)
-    found, lam_x, lam_g = (answer[key].full().ravel() for key in ("x", "lam_x", "lam_g"))
-    return found[:n], lam_x[:n], lam_g
+    solution, lam_x, lam_g = (answer[key].full().ravel() for key in ("x", "lam_x", "lam_g"))
+    return solution[:n], lam_x[:n], lam_g

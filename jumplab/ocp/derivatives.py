@@ -138,7 +138,7 @@ class Formulas:
         lam_f = ca.SX.sym("lam_f")
         g = ca.vertcat(ca.SX(0, 1), *self.rows)
         lam = ca.SX.sym("lam", g.numel())
-        made = {}
+        formulas = {}
         bent = ca.dot(lam, g)
         hessian = ca.SX(x.numel(), x.numel())
         if self.costs:
@@ -153,16 +153,16 @@ class Formulas:
                     bent += lam_f * w * value
                 else:
                     hessian += lam_f * square
-            made["costs"] = [], [ca.vertcat(*values)]
-            made["gradient"] = [weights], [ca.densify(ca.gradient(total, x))]
-            made["gauss_newton"] = [weights], [ca.triu(squares)]
+            formulas["costs"] = [], [ca.vertcat(*values)]
+            formulas["gradient"] = [weights], [ca.densify(ca.gradient(total, x))]
+            formulas["gauss_newton"] = [weights], [ca.triu(squares)]
         if self.rows:
-            made["rows"] = [], self.rows
-            made["jacobian"] = [], [ca.jacobian(g, x)]
+            formulas["rows"] = [], self.rows
+            formulas["jacobian"] = [], [ca.jacobian(g, x)]
         hessian += ca.hessian(bent, x)[0]
-        made["hessian"] = [weights, lam, lam_f], [ca.triu(hessian)]
+        formulas["hessian"] = [weights, lam, lam_f], [ca.triu(hessian)]
         given = [x, self.data, self.parameters]
-        return {name: ca.Function(name, given + more, y) for name, (more, y) in made.items()}
+        return {name: ca.Function(name, given + more, y) for name, (more, y) in formulas.items()}
 
 
 class Formulator:

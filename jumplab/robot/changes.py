@@ -167,8 +167,10 @@ def legs(robot: Robot, factor: float, thigh: float, shank: float) -> tuple[str, 
     Raises :class:`RobotError` as :meth:`.Robot.with_legs` says.
     """
     both = _number(robot, "the factor on the legs", factor)
-    own = {"thighs": thigh, "shanks": shank}
-    factors = [both * _number(robot, f"the factor on the {part}", x) for part, x in own.items()]
+    part_factors = {"thighs": thigh, "shanks": shank}
+    factors = [
+        both * _number(robot, f"the factor on the {part}", x) for part, x in part_factors.items()
+    ]
     root = _parsed(robot)
     remarks = []
     joints = {joint.get("name"): joint for joint in root.findall("joint")}

@@ -65,8 +65,8 @@ def locked_joints(robot: Robot) -> tuple[LockedJoint, ...]:
     if at == model.nframes:
         raise robot.error(f"[published] lacks the link {trunk!r}")
     carrier = model.frames[at].parentJoint
-    own = pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
-    to_base = own * pin.updateFramePlacement(model, data, at).inverse()
+    placement = pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
+    to_base = placement * pin.updateFramePlacement(model, data, at).inverse()
     return tuple(_locked(robot, model, data, carrier, to_base))
 
 
@@ -80,15 +80,15 @@ def _locked(
     robot: Robot, model: pin.Model, data: pin.Data, carrier: int, to_base: pin.SE3
 ) -> list[LockedJoint]:
     """Those of a model whose body ``carrier`` is the base's; ``to_base`` takes the world there."""
-    own = robot.model
-    below = own.createData()
-    pin.computeSubtreeMasses(own, below)
+    reduced = robot.model
+    below = reduced.createData()
+    pin.computeSubtreeMasses(reduced, below)
     moving = {_index(robot, model, name) for name in robot.joint_names}
     edges = {j: {j, model.parents[j]} for j in range(BASE + 1, model.njoints)}
     stiff = {j: ends for j, ends in edges.items() if j not in moving}
     rigid = _reached(carrier, stiff)
     parts = {j: (to_base * data.oMi[j]).act(model.inertias[j]) for j in rigid}
-    scale = own.inertias[BASE].mass / sum(part.mass for part in parts.values())
+    scale = reduced.inertias[BASE].mass / sum(part.mass for part in parts.values())
     out = []
     for j in stiff:
         column = model.idx_vs[j]
@@ -97,7 +97,7 @@ def _locked(
         limbs = tuple(model.names[k] for k in sorted(moving) if edges[k] & beyond)
         part = sum((parts[k] for k in beyond), pin.Inertia.Zero())
         part = pin.Inertia(scale * part.mass, part.lever, scale * part.inertia)
-        mass = part.mass + sum(below.mass[own.getJointId(name)] for name in limbs)
+        mass = part.mass + sum(below.mass[reduced.getJointId(name)] for name in limbs)
         if effort > 0 and mass > HEAVY * robot.total_mass:
             place = (to_base * data.oMi[j]).translation
             # seen from a part that floats, with the base beyond, its joint turns the other way
@@ -109,7 +109,7 @@ def _locked(
 
 def _reached(start: int, edges: dict[int, set[int]]) -> set[int]:
     """Bodies that joints (joint -> its two bodies) connect with one."""
-    found = {start}
-    while more := {k for ends in edges.values() if ends & found for k in ends} - found:
-        found |= more
-    return found
+    reached = {start}
+    while more := {k for ends in edges.values() if ends & reached for k in ends} - reached:
+        reached |= more
+    return reached

@@ -146,9 +146,9 @@ def _losses(moving: list[Joint]) -> Iterator[str]:
     """Which of armature, friction and damping the file has, and which cannot be."""
     wrong = {}  # (key, text) -> joints
     for joint in moving:
-        told = joint.element.find("dynamics")
-        for key, text in told.items() if told is not None else ():
-            if key in OWN and finite(told, (key,)).get(key, -1.0) < 0:
+        dynamics = joint.element.find("dynamics")
+        for key, text in dynamics.items() if dynamics is not None else ():
+            if key in OWN and finite(dynamics, (key,)).get(key, -1.0) < 0:
                 wrong.setdefault((key, text), []).append(joint.name)
     for (key, text), joints in wrong.items():
         yield f"{key} = {text!r} of {listed(joints)} must be a number of 0 or more: not used"

@@ -94,13 +94,13 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
 def _level(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> float:
     """Pitch [rad] at which a foot stands on most of its length; 0 if none helps much."""
     _, points, _ = sole_points(tree, foot, turn, np.inf)
-    found = {}  # angle -> length that touches [m]
+    lengths = {}  # angle -> length that touches [m]
     for angle in sorted(np.arange(-LEANS_RAD, LEANS_RAD, STEP_RAD), key=abs):
         turned = points @ pin.rpy.rpyToMatrix(0.0, angle, 0.0).T
         low = turned[:, 2] < turned[:, 2].min() + thickness(leg_m)
-        found[angle] = np.ptp(turned[low, 0])
-    best = max(found, key=found.get)
-    if found[best] <= 3 * SMALLEST * leg_m:
+        lengths[angle] = np.ptp(turned[low, 0])
+    best = max(lengths, key=lengths.get)
+    if lengths[best] <= 3 * SMALLEST * leg_m:
         return 0.0
     turned = points @ pin.rpy.rpyToMatrix(0.0, best, 0.0).T
     ahead = turned[:, 0] > turned[:, 0].min() + np.ptp(turned[:, 0]) / 2

@@ -239,9 +239,11 @@ def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
             limits = ANY | joint.limits
             add_joint(robot, joint.name, kind, ends, model.jointPlacements[k], joint.axis, limits)
         todo += below
-        own = next((part for part in tree.bodies[carrier] if part in boxes), None)
-        axes = lumped.placed[link].inverse() * shifted(lumped.bodies[own].place) if own else HERE
-        _add_body(robot, link, model.inertias[carrier], boxes.get(own, []), axes=axes)
+        boxed = next((part for part in tree.bodies[carrier] if part in boxes), None)
+        axes = (
+            lumped.placed[link].inverse() * shifted(lumped.bodies[boxed].place) if boxed else HERE
+        )
+        _add_body(robot, link, model.inertias[carrier], boxes.get(boxed, []), axes=axes)
     ET.indent(robot)
     place = shifted(-trunk.place) * lumped.placed[root]
     return filled(
@@ -422,11 +424,11 @@ def _toml(
         )
     motors = {}
     for key in MOTOR:
-        told = {b.joint: b.limits for b in lumped.bodies.values() if key in b.limits}
+        limits = {b.joint: b.limits for b in lumped.bodies.values() if key in b.limits}
         if key in RATIOS:  # speeds as shares of the speed limit
-            values = {joint: x[key] / x["velocity"] for joint, x in told.items()}
+            values = {joint: x[key] / x["velocity"] for joint, x in limits.items()}
         else:
-            values = {joint: x[key] for joint, x in told.items()}
+            values = {joint: x[key] for joint, x in limits.items()}
         motors[RATIOS.get(key, key)] = values
     return filled(
         "robot_import/jumper.toml.in",

@@ -132,8 +132,8 @@ def lump(
     placed = link_poses(model)
     edges = entry(config, "feet", "sole_y_m", count=2)
     changed = {}
-    told = _told_limits(tree, config, roles)
-    limits = {name: _limits(tree, told, roles, name, changed) for name in moving}
+    configured = _configured_limits(tree, config, roles)
+    limits = {name: _limits(tree, configured, roles, name, changed) for name in moving}
     bodies, links = _bodies(tree, model, placed, trunk, feet, limits, sum(edges) / 2)
     if bodies[0].inertia.mass < FRAME_KG:
         raise tree.error(
@@ -277,9 +277,9 @@ def _check_ranges(tree: Tree, bodies: list[Body], roles: RoleJoints) -> None:
             )
 
 
-def _told_limits(tree: Tree, config: dict, roles: RoleJoints) -> dict[str, dict[str, float]]:
+def _configured_limits(tree: Tree, config: dict, roles: RoleJoints) -> dict[str, dict[str, float]]:
     """The numbers of [limits], and where it has none those of [assumed], by joint or role."""
-    told = {}
+    limits = {}
     may = (*LIMITS, *MOTOR, SOURCE)
     for title in ("assumed", "limits"):
         for name, values in table(config, title).items():
@@ -297,29 +297,29 @@ def _told_limits(tree: Tree, config: dict, roles: RoleJoints) -> dict[str, dict[
                 )
             entry(config, title, name, SOURCE, kind=str, default="")
             numbers = {part: entry(config, title, name, part) for part in values if part != SOURCE}
-            told[name] = told.get(name, {}) | numbers
-    return told
+            limits[name] = limits.get(name, {}) | numbers
+    return limits
 
 
 def _limits(
-    tree: Tree, told: dict[str, dict], roles: RoleJoints, joint: str, changed: dict
+    tree: Tree, configured: dict[str, dict], roles: RoleJoints, joint: str, changed: dict
 ) -> dict[str, float]:
-    """The limits of a joint; those that are ``told`` come first; its losses as the file has them,
-    if its motor can overcome them.
+    """The limits of a joint, those that are ``configured`` before those of the file; with the
+    losses of the file, if its motor can overcome them.
     """
     # a joint that is called like a role goes before it
     role = next((r for r, pair in roles.items() if joint in pair and r not in tree.joints), "")
-    values = told.get(role, {}) | told.get(joint, {})
+    values = configured.get(role, {}) | configured.get(joint, {})
     where = f"limits.{key(role or joint)}"
     for sentence in limit_faults(tree, joint, values, where):
         raise RobotError(sentence)
     limits = tree.joints[joint].limits | values
     if sentence := _motor_fault(limits):
         raise tree.error(f"joint {joint!r}: {sentence}; correct [{where}]")
-    own = tree.joints[joint].losses | limits
-    if not (sentence := _motor_fault(own, MOST_LOST)):
-        return own
-    used = len(own) - len(limits)
+    with_losses = tree.joints[joint].losses | limits
+    if not (sentence := _motor_fault(with_losses, MOST_LOST)):
+        return with_losses
+    used = len(with_losses) - len(limits)
     changed[f"joint {joint!r}: losses of the file not used, {sentence}"] = (used, "numbers")
     return limits
 
@@ -332,8 +332,8 @@ def _motor_fault(limits: dict[str, float], most: float = 1.0) -> str:
     effort = limits["effort"]
     free = limits.get(NO_LOAD, speed)
     corner = limits.get(CORNER, free / 2)
-    own = {part: limits.get(part, 0.0) for part in OWN}
-    armature, friction, damping = own.values()
+    losses = {part: limits.get(part, 0.0) for part in OWN}
+    armature, friction, damping = losses.values()
     lost = friction + damping * speed
     if free < speed:
         return (
@@ -343,7 +343,7 @@ def _motor_fault(limits: dict[str, float], most: float = 1.0) -> str:
     if not 0 < corner < free:
         end = "no-load speed" if NO_LOAD in limits else "speed limit"
         return f"corner = {corner:g} rad/s must lie between 0 and the {end}, {free:g} rad/s"
-    if negative := [f"{part} = {x:g}" for part, x in own.items() if x < 0]:
+    if negative := [f"{part} = {x:g}" for part, x in losses.items() if x < 0]:
         return f"{negative[0]} must not be negative"
     if armature > MOST_ARMATURE:
         return (

@@ -94,8 +94,8 @@ def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
             sentence = _sentence(e)
             before = [text, *texts.values()]
             after = before
-            if (found := UNKNOWN.search(sentence)) and found[2] in SETTINGS:
-                key, tag = found.groups()
+            if (match := UNKNOWN.search(sentence)) and match[2] in SETTINGS:
+                key, tag = match.groups()
                 given = re.compile(rf"(<{tag}\b[^>]*?)\s{key}\s*=\s*([\"']).*?\2", re.DOTALL)
                 after = [given.sub(r"\1", x) for x in before]
             if after == before:
@@ -229,18 +229,18 @@ def _pairs_with_others(spec: mujoco.MjSpec, notes: list[str]) -> list[mujoco.Mjs
     are here are marked as such that touch.
     """
     here = {geom.name: geom for geom in spec.geoms}
-    found = {}
+    by_geom = {}
     for pair in spec.pairs:
         ends = pair.geomname1, pair.geomname2
         if lost := [name for name in ends if name not in here]:
-            found[lost[0]] = [*found.get(lost[0], []), pair]
+            by_geom[lost[0]] = [*by_geom.get(lost[0], []), pair]
             for name in {*ends} & {*here}:
                 here[name].contype = 1
-    if found:
+    if by_geom:
         notes.append(
-            f"the pairs with {listed(found)}, which is terrain or in another file, are left out"
+            f"the pairs with {listed(by_geom)}, which is terrain or in another file, are left out"
         )
-    return [pair for pairs in found.values() for pair in pairs]
+    return [pair for pairs in by_geom.values() for pair in pairs]
 
 
 def _lost(meshes: Iterable[mujoco.MjsMesh], sentence: str) -> list[mujoco.MjsMesh]:
@@ -314,8 +314,8 @@ def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
 def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
     """Least and greatest force (2,) of an actuator, before its gear; infinite if nothing says."""
     group = int(model.actuator_group[a])
-    off = bool(model.opt.disableactuator >> group & 1)
-    if off or not (np.any(model.actuator_gainprm[a, :2]) or model.actuator_biastype[a]):
+    disabled = bool(model.opt.disableactuator >> group & 1)
+    if disabled or not (np.any(model.actuator_gainprm[a, :2]) or model.actuator_biastype[a]):
         return np.zeros(2)  # switched off, or a damper
     ends = np.array([-np.inf, np.inf])
     if model.actuator_forcelimited[a]:

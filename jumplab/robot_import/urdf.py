@@ -306,10 +306,10 @@ class Joint:
     @classmethod
     def read(cls, e: ET.Element) -> Joint:
         """The joint of an element that has passed the checks."""
-        axis, limit, mimic, own = (e.find(x) for x in ("axis", "limit", "mimic", "dynamics"))
+        axis, limit, mimic, dynamics = (e.find(x) for x in ("axis", "limit", "mimic", "dynamics"))
         direction = np.array([1.0, 0.0, 0.0]) if axis is None else numbers(axis.get("xyz"), 3)
         limits = finite(limit, LIMITS)
-        losses = {key: x for key, x in finite(own, OWN).items() if x > 0}
+        losses = {key: x for key, x in finite(dynamics, OWN).items() if x > 0}
         kind = e.get("type")
         driven = kind in ("revolute", "continuous") and limits.get("effort") != 0 and mimic is None
         follows = None

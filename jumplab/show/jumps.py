@@ -292,7 +292,7 @@ def _used_up(tape: Tape, robot: Robot, limits: Limits) -> dict[str, np.ndarray]:
     speeds, torques = tape.v[:, 6:], tape.tau
     least, most = (limits.torque_share * edge for edge in motors.range(speeds))
     room = limits.range_margin_rad + NEAR_STOP_RAD
-    found = {
+    by_limit = {
         "torque": (torques >= FULL * most) | (torques <= FULL * least),
         "speed": np.abs(speeds) >= FULL * limits.speed_share * motors.speed,
         "lower stop": tape.q[:, 7:] <= motors.lower + room,
@@ -300,7 +300,7 @@ def _used_up(tape: Tape, robot: Robot, limits: Limits) -> dict[str, np.ndarray]:
     }
     rows = {}
     for title, sides in _joints(tape, robot).items():
-        rows |= {f"{title}, {what}": used[:, sides].any(axis=1) for what, used in found.items()}
+        rows |= {f"{title}, {what}": used[:, sides].any(axis=1) for what, used in by_limit.items()}
     ground = ground_reaction(tape, robot)
     launch = tape.phase == "launch"
     length = robot.foot.toe - robot.foot.heel

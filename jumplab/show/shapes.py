@@ -239,18 +239,18 @@ def rounded_body(robot: Robot) -> list[Part]:
     # a joint without a box is drawn with the next one below that has one, or with its parent
     ends = _ends(model, boxes.keys())
     parts = []
-    for joint, own in boxes.items():
+    for joint, joint_boxes in boxes.items():
         kind = _kind(robot, joint)
         if kind == "trunk":
             continue
-        radius = END_SHARE * min((2 * box.half.min() for box in own), default=2 * LIMB_M)
+        radius = END_SHARE * min((2 * box.half.min() for box in joint_boxes), default=2 * LIMB_M)
         radius = max(radius, END_SHARE * LIMB_M)
         rounding = SOLE_ROUNDING if kind == "rest" else ROUNDING
         balls = [
             data.oMi[joint].actInv(data.oMi[end].translation) + radius * BALL
             for end in {joint, *ends[joint]}
         ]
-        solid = np.concatenate([*(box.rounded(rounding) for box in own), *balls])
+        solid = np.concatenate([*(box.rounded(rounding) for box in joint_boxes), *balls])
         parts.append(_hull(joint, kind, solid))
     return [*parts, *_trunk(robot, data, boxes.get(1, [])), *_discs(robot)]
 

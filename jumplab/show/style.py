@@ -75,12 +75,12 @@ def _style(whole: bool) -> Iterator[None]:
     with those that differ from Matplotlib's defaults left as they are.
     """
     with _TURN:
-        own = {} if whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
+        settings = {} if whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
         with plt.style.context(STYLE_FILE):
-            larger = own.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
-            for key in (key for key in TEXT_SIZES if key not in own):
+            larger = settings.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
+            for key in (key for key in TEXT_SIZES if key not in settings):
                 rcParams[key] *= larger
-            rcParams.update(own)
+            rcParams.update(settings)
             yield
 
 
@@ -123,11 +123,11 @@ class Picture(Figure):
         return filled("show/picture.html", png=self.png(), caption=self.caption)
 
 
-def file_of(fig: Figure, kind: str, **how: Any) -> bytes:
-    """A figure as a file of that kind ("png", "pdf"); ``how`` are options of ``Figure.savefig``."""
+def file_of(fig: Figure, kind: str, **options: Any) -> bytes:
+    """A figure as a file of that kind ("png", "pdf"); ``options`` of ``Figure.savefig``."""
     buffer = io.BytesIO()
     with _style(whole=True), rc_context(getattr(fig, "settings", {})):
-        fig.savefig(buffer, format=kind, **how)
+        fig.savefig(buffer, format=kind, **options)
     return buffer.getvalue()
 
 

@@ -73,12 +73,12 @@ def check(result: SimulationResult) -> tuple[Finding, ...]:
         ).max(),
         "claimed landing, short of 3 s by": _short_landing(result),
     }
-    found = []
+    findings = []
     for name, (limit, unit, hides, *substepped) in QUESTIONS.items():
         if substepped and engine["substeps"] > 1:
             (limit,) = substepped
-        found.append(Finding(name, float(values[name]), limit, unit, hides))
-    return tuple(found)
+        findings.append(Finding(name, float(values[name]), limit, unit, hides))
+    return tuple(findings)
 
 
 def _largest_jump(result: SimulationResult) -> float:
@@ -304,5 +304,5 @@ def _outside(
 def _short_landing(result: SimulationResult) -> float:
     """Seconds that a claimed landing falls short of standing on the feet alone."""
     lying = result.stray[result.phase == "landing"].any(axis=1)
-    stood = STEP_S * float(np.argmax([*lying, True]))
-    return max(0.0, STAND_S - stood) if result.metrics.landed else 0.0
+    standing_s = STEP_S * float(np.argmax([*lying, True]))
+    return max(0.0, STAND_S - standing_s) if result.metrics.landed else 0.0

@@ -81,10 +81,10 @@ class MujocoEngine(Engine):
         """As of every engine; springs of soft ground need steps as short as those of hard contacts,
         and an elliptic cone at their ratio of friction.
         """
-        found = super().contact_of(contact)
+        resolved = super().contact_of(contact)
         if scene and any(block.soft_m for block in scene.blocks):
-            return replace(found, substeps=max(found.substeps, HARD.substeps), elliptic=True)
-        return found
+            return replace(resolved, substeps=max(resolved.substeps, HARD.substeps), elliptic=True)
+        return resolved
 
     def _build(self, friction: float) -> None:
         spec = self._spec()

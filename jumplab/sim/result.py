@@ -361,22 +361,22 @@ class _Jump:
     def launch(self) -> dict[str, Any]:
         """Up to the touchdown."""
         run = self.run
-        off = self.liftoff
+        liftoff = self.liftoff
         stray = run.stray[: self.touchdown].any(axis=0)
         out = dict(
             stray_contacts=tuple(run.link_names[i] for i in np.flatnonzero(stray)),
-            launch_impulse=_xz(run.foot_wrench[:off, :, :3].sum(axis=(0, 1)) * STEP_S),
+            launch_impulse=_xz(run.foot_wrench[:liftoff, :, :3].sum(axis=(0, 1)) * STEP_S),
             slip_m=self.slip(),
         )
-        if off is None:
+        if liftoff is None:
             return out
         rise = max(map(self.rise, self.flown))
         return out | dict(
-            liftoff_s=float(run.t[off]),
+            liftoff_s=float(run.t[liftoff]),
             com_rise_m=rise,
-            com_apex_m=rise + float(run.com[off, 2] - run.com[0, 2]),
-            takeoff_velocity=_xz(run.com_velocity[off]),
-            takeoff_momentum=float(run.L[off]),
+            com_apex_m=rise + float(run.com[liftoff, 2] - run.com[0, 2]),
+            takeoff_velocity=_xz(run.com_velocity[liftoff]),
+            takeoff_momentum=float(run.L[liftoff]),
         )
 
     def slip(self) -> float:

@@ -301,8 +301,8 @@ class Scene:
                 f"{refused}, a corner of its soles is {1e3 * gap:+.0f} mm above the "
                 f"ground, at most {1e3 * UNEVEN_M:g}; let the ground be even around x = 0, at z = 0"
             )
-        off = gauge.com(q) - [corners.max(axis=0), corners.min(axis=0)]
-        beyond = (off * [[1.0], [-1.0]])[:, :2].max()
+        offsets = gauge.com(q) - [corners.max(axis=0), corners.min(axis=0)]
+        beyond = (offsets * [[1.0], [-1.0]])[:, :2].max()
         if beyond > 0:
             raise InputError(
                 f"{refused}, its CoM is {1e3 * beyond:.0f} mm beyond the edge of its soles; "

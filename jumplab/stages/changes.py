@@ -113,15 +113,15 @@ def sorted_out(
         extra = (extra,) if isinstance(extra, Term) else extra
         if isinstance(extra, str) or not isinstance(extra, Iterable):
             raise InputError(f"own terms of {name!r} must be a list of terms, got {quoted(extra)}")
-        own = by_stage[stage][0]
-        own[phase] = (*own.get(phase, ()), *extra)
-        for term in own[phase]:
+        added = by_stage[stage][0]
+        added[phase] = (*added.get(phase, ()), *extra)
+        for term in added[phase]:
             require_type(term, Term, f"an own term of {name!r}")
     for kind, names in enumerate((weights, dict.fromkeys(off)), 1):
         for name, value in names.items():
             stage, rest = _stage_of(name)
             by_stage[stage][kind][rest] = value
-    return {x: StageChanges(own, new, tuple(gone)) for x, (own, new, gone) in by_stage.items()}
+    return {x: StageChanges(added, new, tuple(gone)) for x, (added, new, gone) in by_stage.items()}
 
 
 def _stage_and_phase(name: Any) -> tuple[str, str]:

@@ -113,8 +113,8 @@ class JumpPlan(Shown, Named):
         if self.task.rotation_rad:
             jump += f", turned by {round(math.degrees(self.task.rotation_rad))} deg"
         jump += f", rise {self.planned_rise_m:.2f} m"
-        how = self.method + " without stage 2" * (self.srmp is not None and self.joints is None)
-        words = f"{self.robot.name}, {jump}, {how}, {float(self.tape.t[-1]):.2f} s"
+        method = self.method + " without stage 2" * (self.srmp is not None and self.joints is None)
+        words = f"{self.robot.name}, {jump}, {method}, {float(self.tape.t[-1]):.2f} s"
         if "audit" not in vars(self) or (self.audit.sound and all(self.landings)):
             return words
         return f"{words}; {self.verdict}"
@@ -270,11 +270,11 @@ def flown(tape: Tape, robot: Robot) -> float:
     """Distance ahead [m] that the last flight covers: of the feet in the end, from where they stood
     first, less that of those that leave.
     """
-    off = tape.flights[-1].start
-    origin, turn = feet_of(robot, tape.q[[0, off, -1]])
+    takeoff = tape.flights[-1].start
+    origin, turn = feet_of(robot, tape.q[[0, takeoff, -1]])
     toes = (origin + turn @ robot.foot.tip)[..., 0]  # (3, 2)
     ahead = toes[1:] - toes[0]
-    return float(ahead[1].mean() - ahead[0, tape.contacts[off - 1] > 0].mean())
+    return float(ahead[1].mean() - ahead[0, tape.contacts[takeoff - 1] > 0].mean())
 
 
 def _summary(
@@ -325,11 +325,11 @@ def _summary(
 
 
 def _solved(solution: Solution) -> tuple[dict[str, float], dict[str, Any]]:
-    """Weights of a solution's costs, and what its solver said."""
+    """Weights of a solution's costs, and the statistics of its solver."""
     weights = {f"{row['phase']}/{row['name']}": row["weight"] for row in solution.cost_shares}
-    said = vars(solution.statistics).items()
+    statistics = vars(solution.statistics).items()
     times = ("build_s", "solve_s")  # these stand in the table of stages
-    return weights, {"solver": "ipopt", **{k: v for k, v in said if k not in times}}
+    return weights, {"solver": "ipopt", **{k: v for k, v in statistics if k not in times}}
 
 
 def _terms(solution: Solution) -> list[dict[str, Any]]:
@@ -339,10 +339,10 @@ def _terms(solution: Solution) -> list[dict[str, Any]]:
     }
     rows = []
     for row in solution.problem.table():
-        found = used.get((row["phase"], row["name"]), {})
-        if "weight" in found:
-            row["value"] = f"weight {found['weight']:g}"
-        rows.append(row | {key: found.get(key) for key in ("share", "node", "slack")})
+        result = used.get((row["phase"], row["name"]), {})
+        if "weight" in result:
+            row["value"] = f"weight {result['weight']:g}"
+        rows.append(row | {key: result.get(key) for key in ("share", "node", "slack")})
     return rows
 
 

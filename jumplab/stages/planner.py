@@ -490,16 +490,16 @@ class Planner(Shown):
             options = {"begin": motion, "stance": stance, "starts": FOLLOWED}
         last = self._whole_body(contacts=contacts, **settings)
         body = last.plan(level, weights=asked.weights, **options)
-        found = planned(body.tape)
+        reached = planned(body.tape)
         height, _ = contacts.surface
         task = JumpTask(
-            found["planned_distance_m"],
-            max(LEAST_RISE_M, found["planned_rise_m"]),
+            reached["planned_distance_m"],
+            max(LEAST_RISE_M, reached["planned_rise_m"]),
             height,
             gravity=gravity,
             # an edge lies across the way ahead, whatever the feet do beside it
-            side_m=0.0 if height else found["planned_side_m"],
-            yaw_rad=found["planned_yaw_rad"],
+            side_m=0.0 if height else reached["planned_side_m"],
+            yaw_rad=reached["planned_yaw_rad"],
         )
         return JumpPlan.of(self.robot, "direct", replace(body, task=task), contacts=contacts)
 

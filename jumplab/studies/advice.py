@@ -81,8 +81,8 @@ def advised(
         advice = _advice(refusal, planner, task, method, steps=1 if spent_s is None else 2)
     if spent_s is not None:
         advice = f"planning was given up after {spent_s:g} s of processor time; {advice}"
-    said = "; ".join([str(refusal), *_records_near(planner.robot, task), advice])
-    return type(refusal)(said, **vars(refusal))
+    sentence = "; ".join([str(refusal), *_records_near(planner.robot, task), advice])
+    return type(refusal)(sentence, **vars(refusal))
 
 
 def keep_record(robot: Robot, what: str, value: float) -> None:
@@ -108,16 +108,16 @@ def _shipped() -> dict[str, dict[str, float]]:
 
 def _records_near(robot: Robot, task: JumpTask) -> list[str]:
     """Records of a robot that a target comes near to, or exceeds, in words."""
-    said = []
+    sentences = []
     for what in ("height_m", "distance_m", "platform_m", "side_m", "yaw_rad"):
         asked = abs(getattr(task, what))
         record = known_record(robot, what) if asked else None
         if record is not None and asked > NEAR_RECORD * record:
             unit = "rad" if what == "yaw_rad" else "m"
-            said.append(
+            sentences.append(
                 f"the record of {robot.name} is a {RANGES[what][0]} of at least {record:.3f} {unit}"
             )
-    return said
+    return sentences
 
 
 def _advice(
@@ -157,11 +157,11 @@ def _run_up(planner: Planner, task: JumpTask, easier: JumpTask) -> str:
     if not alone or not abs(easier.distance_m) < task.distance_m or left_s() <= 0:
         return ""
     running = replace(task, takeoff="left", run_up=STEPS)
-    said = f"a run-up of {STEPS} steps (takeoff='left', run_up={STEPS})"
-    tell(f"refused; trying {said}")
+    run_up = f"a run-up of {STEPS} steps (takeoff='left', run_up={STEPS})"
+    tell(f"refused; trying {run_up}")
     if refused(planner, running, USUAL) is not None:
         return ""
-    return f"; or for {said}, which reaches {task.distance_m:g} m"
+    return f"; or for {run_up}, which reaches {task.distance_m:g} m"
 
 
 def refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | None:

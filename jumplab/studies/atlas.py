@@ -86,7 +86,7 @@ class Atlas:
         folder: str | Path | None = None,
         jobs: int = 1,
         progress: bool | None = None,
-        **how: Any,
+        **arguments: Any,
     ) -> Atlas:
         """Plan the grid of ``distances`` and ``heights`` [m].
 
@@ -95,8 +95,8 @@ class Atlas:
         folder : where ``atlas.npz`` is written; an unfinished one is gone on with, and a finished
             one read.
         jobs, progress : as of :func:`.study.open_study`.
-        how : further arguments of :class:`jumplab.Planner`: terms, weights, off, limits, mesh, keep
-            (True).
+        arguments : further ones of :class:`jumplab.Planner`: terms, weights, off, limits, mesh,
+            keep (True).
 
         Raises
         ------
@@ -110,7 +110,7 @@ class Atlas:
             raise InputError(
                 f"the atlas has {len(distances)} x {len(heights)} nodes, at most {MAX_CELLS}"
             )
-        planner = Planner(robot, **{"keep": True} | how)
+        planner = Planner(robot, **{"keep": True} | arguments)
         atlas = cls(robot.name, distances, heights, {}, key_of_plans(planner.stage("direct")))
         if folder is not None and (Path(folder) / FILE).exists():
             there = cls.load(folder)

@@ -83,7 +83,7 @@ class Improved(Shown):
     def line(self) -> str:
         """Gain, the changes that make it, and the limits that end the new record, in one line."""
         old, new = self.before, self.after
-        made = [
+        changed = [
             f"{x.number} {x.before:.3g} -> {x.after:.3g}{x.unit and ' ' + x.unit}"
             + " (at its end)" * x.ends
             for x in self.changes
@@ -92,7 +92,7 @@ class Improved(Shown):
         ends = list(dict.fromkeys(f"{x.joint} {x.limit}".strip() for x in new.limits))[:3]
         return (
             f"{old.plan.robot.name}: {old.what} at least {old.value:.3f} -> {new.value:.3f} "
-            f"{old.unit} by {', '.join(made) or 'no change'}; then it ends by {', '.join(ends)}"
+            f"{old.unit} by {', '.join(changed) or 'no change'}; then it ends by {', '.join(ends)}"
         )
 
 
@@ -140,18 +140,18 @@ def _climbed(record: Record, numbers: Free, budget: int) -> tuple[np.ndarray, np
             break
         each = zip(numbers.values(), moved, strict=True)
         tell(f"record with {', '.join(f'{x.number} {s * x.before:.3g}' for x, s in each)}")
-        found = None
+        candidate = None
         with suppress(RobotError):
             other = program.like(_changed(record.plan.robot, numbers, moved))
             for start in (RECORD, SEEKING):
                 with suppress(SolverError):
-                    found = other.solve(asked, start, from_solved(other, solved))
+                    candidate = other.solve(asked, start, from_solved(other, solved))
                     break
-        if found is None or pricer.reached(found) <= pricer.reached(solved):
+        if candidate is None or pricer.reached(candidate) <= pricer.reached(solved):
             steps = steps / 2
             continue
         buys += prices * (moved / shares - 1)
-        shares, program, solved, prices = moved, other, found, None
+        shares, program, solved, prices = moved, other, candidate, None
     return shares, buys
 
 

@@ -343,13 +343,13 @@ class Draft:
                 f"clip {self.clip.name!r}: its contacts are {' '.join(feet)}; a jump to a target "
                 f"needs a clip that flies once, takes off from both feet and lands on both"
             )
-        stood, middle = (self.middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
-        turn = goal.yaw_rad - (middle[2] - stood[2])
-        way = np.add(stood[:2], [goal.distance_m, goal.side_m])
+        takeoff, landing = (self.middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
+        turn = goal.yaw_rad - (landing[2] - takeoff[2])
+        way = np.add(takeoff[:2], [goal.distance_m, goal.side_m])
         back = pin.rpy.rpyToMatrix(0.0, 0.0, turn)[:2, :2].T
 
         def there(x: np.ndarray) -> np.ndarray:
-            return (x - middle[:2]) @ back + way
+            return (x - landing[:2]) @ back + way
 
         _, begin, end = self.phases[k]
         share = np.clip((self.clip.t - begin) / (end - begin), 0.0, 1.0)[:, None]
@@ -573,8 +573,8 @@ def _changes(before: ClipReport, draft: Draft, plan: JumpPlan) -> list[dict[str,
     """Rows of what the clip and the plan have, and by how much they differ."""
     phases = list(plan.whole_body.phases.values())
     pairs = [(x.q, draft.sampled(k, len(x.q))) for k, x in enumerate(phases)]
-    off = np.concatenate([q[:, : clip.shape[1]] - clip for q, clip in pairs])
-    joints = np.abs(off[:, BASE:])
+    difference = np.concatenate([q[:, : clip.shape[1]] - clip for q, clip in pairs])
+    joints = np.abs(difference[:, BASE:])
     moved = [0.0]
     for contact, (k, side) in enumerate(plan.contacts.landings):
         wanted = np.mean(plan.whole_body.schedule.foothold(contact), axis=1)
@@ -585,7 +585,7 @@ def _changes(before: ClipReport, draft: Draft, plan: JumpPlan) -> list[dict[str,
     changes = {
         "joints, rms [rad]": np.sqrt((joints**2).mean()),
         f"joints, largest [rad]: {worst}": joints.max(),
-        "base, rms [m]": np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()),
+        "base, rms [m]": np.sqrt((difference[:, :3] ** 2).sum(axis=1).mean()),
         "footholds, largest [m]": max(moved),
     }
     rows = [{"what": name, "change": float(x)} for name, x in changes.items()]

@@ -236,9 +236,9 @@ def record(
     planner = Planner(robot, keep=True, **changes)
     search = _Search(planner, what, given)
     with unexplained():
-        found, best = search.from_easy()
+        results, best = search.from_easy()
     if best is None:
-        raise search.refusal(found)
+        raise search.refusal(results)
     with unexplained():
         plan, solved, program = search.plan_at(best)
         share, runs = search.played(plan, share, engines)
@@ -249,9 +249,9 @@ def record(
         bound = bounds.most(search.stage.body, search.stage.limits, plan.task, what)
     if given is None and not any(changes.values()):
         keep_record(robot, what, value)
-    made = plan, plan.audit, found, ends, share, runs
+    parts = plan, plan.audit, results, ends, share, runs
     asked = {"given": given, "share": share, "engines": engines, **changes}
-    return Record(what, value, bound, *made, program, solved, asked)
+    return Record(what, value, bound, *parts, program, solved, asked)
 
 
 class _Search:
@@ -297,13 +297,13 @@ class _Search:
 
     def from_easy(self) -> tuple[dict[str, float], Solved | None]:
         """Results of all starts, and the best one; None if none of them led anywhere."""
-        found: dict[str, float] = {}
+        results: dict[str, float] = {}
         best: list[tuple] = []
         for task in self.starts(best):
             size = f"{getattr(task, self.what):.3f} {unit_of(self.what)}"
             word = f"{size}, rise {task.height_m:.3f} m"
             tell(f"record of {self.planner.robot.name} from {word}")
-            found[word] = math.nan
+            results[word] = math.nan
             self.task = task
             try:
                 # after steps links meet, and a record begins with their rows
@@ -318,14 +318,14 @@ class _Search:
                 continue
             reached = program.found(task, solved)
             self.refuse_end(reached, solved)
-            found[word] = getattr(reached, self.what)
-            best.append((found[word], reached, solved))
+            results[word] = getattr(reached, self.what)
+            best.append((results[word], reached, solved))
         if not best:
-            return found, None
+            return results, None
         _, self.task, solved = max(best, key=lambda x: x[0])
-        return found, solved
+        return results, solved
 
-    def refusal(self, found: Mapping[str, float]) -> InfeasibleError:
+    def refusal(self, results: Mapping[str, float]) -> InfeasibleError:
         """Reason why there is no record: that of the last easy jump, the smallest."""
         why = "it has a plan, which leads nowhere"
         try:
@@ -334,7 +334,7 @@ class _Search:
             why = str(e)
         return InfeasibleError(
             f"robot {self.planner.robot.name}: no record of {self.what}, since none of "
-            f"{len(found)} easy jumps led to one; the last one: {why}"
+            f"{len(results)} easy jumps led to one; the last one: {why}"
         )
 
     def largest(self, program: Program, asked: Asked) -> Solved:
@@ -390,14 +390,14 @@ class _Search:
         program = self.program(self.task)
         most = getattr(self.task, self.what)
         failed = ""
-        made = None
+        accepted = None
         low, share, high = 0.0, 1.0, 1.0
         for _ in range(1 + HALVINGS):
             try:
                 if share == 1:  # finer meshes may allow less
                     body = self.stage.refined(program, Asked(self.task, near=best), RECORD)
                 else:
-                    near = best if made is None else made[1]
+                    near = best if accepted is None else accepted[1]
                     with patience(max(LEAST_S, min(left_s(), HALVING_S * program.size))):
                         body = self.stage.plan(self.at(self.task, share), near=near)
                 plan = JumpPlan.of(robot, "direct", body)
@@ -407,17 +407,17 @@ class _Search:
             if failed:
                 high = share
             else:
-                made = plan, body, share
+                accepted = plan, body, share
                 low = getattr(body.task, self.what) / most
             if high - low <= 2 * SAME:
                 break
             share = (low + high) / 2
-        if made is None:
+        if accepted is None:
             raise SolverError(
                 f"robot {robot.name}: {self.what} reaches {most:.3f} at the nodes, but no plan "
                 f"down to {high:.0%} of it passes the audit ({failed})"
             )
-        plan, body, share = made
+        plan, body, share = accepted
         if share == 1:
             contacts = body.schedule.contacts
             same = contacts == program.contacts
@@ -471,15 +471,15 @@ def _binding(program: Program, task: JumpTask, solved: Solved) -> list[Binding]:
     phases = {p.name: p for p in solved.solution.problem.phases}
     ends = np.cumsum([x.duration for x in solved.solution.phases.values()]).tolist()
     began = dict(zip(phases, [0.0, *ends], strict=False))
-    found: dict[tuple, list] = {}
+    by_limit: dict[tuple, list] = {}
     for (owner, term), column, share, lam, limit in program.limits_of(Asked(task), solved):
         worth = lam * np.where(np.isfinite(limit), np.abs(limit), 0.0) / WORTH
         for way in (1, -1):
             key = owner in phases and limit_of(phases[owner], program, term, column, way)
             if key and (way * worth > 0).any():
-                found.setdefault((owner, *key), []).append((share, np.maximum(way * worth, 0.0)))
+                by_limit.setdefault((owner, *key), []).append((share, np.maximum(way * worth, 0.0)))
     rows = []
-    for (owner, limit, joint), parts in found.items():
+    for (owner, limit, joint), parts in by_limit.items():
         share = parts[0][0]
         worth = sum(x for _, x in parts)
         times = share[worth > BINDING_SHARE * worth.max()] * solved.solution.phases[owner].duration

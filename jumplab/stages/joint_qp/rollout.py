@@ -245,8 +245,8 @@ class JointMapper:
             time.perf_counter() - began,
             max(rows.residual),
         )
-        made = dict(statistics=statistics, options=self.options, problem=self.problem)
-        return JointPlan(**columns, **made)
+        fields = dict(statistics=statistics, options=self.options, problem=self.problem)
+        return JointPlan(**columns, **fields)
 
 
 def map_to_joints(

@@ -377,7 +377,7 @@ class Contacts:
     @classmethod
     def step_off(cls, robot: Robot, drop_m: float, ahead_m: float | None = None) -> Contacts:
         """Off an edge with one foot first, in flight, and down on both, ``drop_m`` [m] lower."""
-        low = Place(_off(robot, ahead_m), up_m=-drop_m)
+        low = Place(_past_edge_m(robot, ahead_m), up_m=-drop_m)
         return cls.of(" ".join(_course("left", 0, "both")), robot, [low, low])
 
     @classmethod
@@ -385,7 +385,7 @@ class Contacts:
         cls, robot: Robot, drop_m: float, ahead_m: float | None = None, jump_m: float | None = None
     ) -> Contacts:
         """Off an edge ``drop_m`` [m] down onto both feet, and at once on by ``jump_m`` [m]."""
-        low = Place(_off(robot, ahead_m), up_m=-drop_m)
+        low = Place(_past_edge_m(robot, ahead_m), up_m=-drop_m)
         far = replace(low, ahead_m=low.ahead_m + _step(robot, jump_m))
         return cls.of("LR L l - LR lr - LR", robot, [low, low, far, far])
 
@@ -445,8 +445,8 @@ def _check_count(name: str, count: int, least: int) -> None:
         raise InputError(f"{name} = {quoted(count)} is outside {least} ... {MOST_STEPS}")
 
 
-def _off(robot: Robot, given_m: float | None) -> float:
-    """The way off an edge [m]: a step, and the sole."""
+def _past_edge_m(robot: Robot, given_m: float | None) -> float:
+    """Distance at which feet come down past an edge [m]: ``given_m``, or a step and the sole."""
     foot = robot.foot
     return _step(robot, None) + (foot.toe - foot.heel) if given_m is None else given_m
 

@@ -112,8 +112,8 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
     after = [p.ahead_m for p in contacts.places[first:]]
     if contacts.aimed:
         height = task.platform_m
-        stood = len(contacts.first)
-        aimed = [contacts.is_aimed(stood + i) for i in range(len(contacts.places))]
+        n_initial = len(contacts.first)
+        aimed = [contacts.is_aimed(n_initial + i) for i in range(len(contacts.places))]
         first = aimed.index(True)
         before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
         after = [before[-1] + task.distance_m]
@@ -121,11 +121,11 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
     length = 2 * body.half_m
     if contacts.over:
         first, last, top = contacts.over
-        stood = len(contacts.first)
+        n_initial = len(contacts.first)
         for i, place in enumerate(contacts.places):
             ends = place.ahead_m - length, place.ahead_m
-            if ends[0] < last and first < ends[1] and not contacts.is_aimed(stood + i):
-                phase, side = contacts.landings[stood + i]
+            if ends[0] < last and first < ends[1] and not contacts.is_aimed(n_initial + i):
+                phase, side = contacts.landings[n_initial + i]
                 raise InputError(
                     f"phase {contacts.phases[phase].name!r}: the {SIDES[side]} foot would come "
                     f"down from {ends[0]:.2f} to {ends[1]:.2f} m, on the block from {first:.2f} to "

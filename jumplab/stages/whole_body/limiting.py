@@ -57,14 +57,14 @@ def held_back(program: Program, failure: SolverError) -> str:
                 worth[key] = worth.get(key, 0.0) + float(np.maximum(way * size, 0.0).sum())
     most = max(worth.values(), default=0.0)
     names = sorted((key for key, x in worth.items() if x > SHARE * most), key=lambda k: -worth[k])
-    said = []
+    words = []
     for limit, joint in names[:NAMED]:
         a = program.robot.actuators[joint]
         if limit.endswith("stop"):
-            said.append(f"the {limit} of joint {joint!r}, {a[limit.split()[0]]:.3g} rad")
+            words.append(f"the {limit} of joint {joint!r}, {a[limit.split()[0]]:.3g} rad")
         elif limit == "speed":
-            said.append(f"the speed of joint {joint!r}, {a['speed']:.3g} rad/s")
+            words.append(f"the speed of joint {joint!r}, {a['speed']:.3g} rad/s")
         else:
             at = f" up to {a['speed']:.3g} rad/s" * (limit == TORQUE_SPEED)
-            said.append(f"the torque of joint {joint!r}, {a['effort']:.3g} N m{at}")
-    return " and ".join(said)
+            words.append(f"the torque of joint {joint!r}, {a['effort']:.3g} N m{at}")
+    return " and ".join(words)

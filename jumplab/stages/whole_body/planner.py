@@ -129,8 +129,8 @@ class WholeBodyPlanner:
         ``weights`` ("term" -> weight) of one plan may ask for an uneven motion.
         """
         changes = self.usual.changes
-        own = self.usual.follows or self.free.even or not (task.in_plane and self.contacts.even)
-        if own or self._even is None:
+        single = self.usual.follows or self.free.even or not (task.in_plane and self.contacts.even)
+        if single or self._even is None:
             return [self.usual]
         names = (*weights, *changes.weights, *changes.off)
         # an own term may ask for an uneven motion, but in the plane there is none

@@ -303,8 +303,8 @@ class Program(Shown):
         """The target that a solution has reached: ``task`` with what was sought [m, rad]."""
         if not self.sought:
             return task
-        found = next(iter(solved.solution.phases.values())).constants
-        new = {SOUGHT[name]: found[name] for name in self.sought}
+        constants = next(iter(solved.solution.phases.values())).constants
+        new = {SOUGHT[name]: constants[name] for name in self.sought}
         if "takeoff_speed" in self.sought:
             new["height_m"] = new["height_m"] ** 2 / (2 * task.gravity)
         return replace(task, **{k: float(np.clip(x, *RANGES[k][1:])) for k, x in new.items()})

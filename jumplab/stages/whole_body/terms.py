@@ -91,7 +91,7 @@ def dynamics(m: Mode, skip: tuple[int, int]) -> list[Term]:
     free = m.free
     mg = m.body.mg
     shared = {"skip": skip, "group": "dynamics"}
-    how = shared | {"identity": True}
+    options = shared | {"identity": True}
     effort = np.array([*m.body.motors.effort[m.held], *(x.effort for x in m.locked)])
 
     def torques(p):
@@ -108,9 +108,9 @@ def dynamics(m: Mode, skip: tuple[int, int]) -> list[Term]:
         return ca.vertcat(p.needed[2][m.held], *locked) / ca.DM(effort)
 
     rows = [
-        Term("joint dynamics", "ours", "of the effort", "node", torques, **how),
-        Term("base forces", "ours", "N", "node", forces, **how, scale=mg),
-        Term("base moments", "ours", "N m", "node", moments, **how, scale=MOMENT_ARM_M * mg),
+        Term("joint dynamics", "ours", "of the effort", "node", torques, **options),
+        Term("base forces", "ours", "N", "node", forces, **options, scale=mg),
+        Term("base moments", "ours", "N m", "node", moments, **options, scale=MOMENT_ARM_M * mg),
     ]
     if len(effort):
         locked = [m.limits.torque_share * x.effort for x in m.locked]
@@ -337,8 +337,8 @@ def foot_rows(m: Mode, side: int, joined: bool, landed: bool) -> list[Term]:
         return moving(p, p.tree.own_accelerations, p.a)
 
     def row(word, unit, of, scale, skip):
-        how = {"identity": True, "scale": scale, "skip": (skip, 0), "group": name}
-        return Term(f"{name} foot {word}", "ours: contact", unit, "node", of, **how)
+        options = {"identity": True, "scale": scale, "skip": (skip, 0), "group": name}
+        return Term(f"{name} foot {word}", "ours: contact", unit, "node", of, **options)
 
     first = int(joined or not landed)
     return [
@@ -371,8 +371,8 @@ def torsion(m: Mode, side: int) -> Term:
         return ca.vertcat(arm * force[2] ** 2 - twist, arm * force[2] ** 2 + twist)
 
     words = f"spin of {SIDES[side]} foot", "ours: friction", "m, of the squared weight", "node"
-    how = {"scale": MOMENT_ARM_M / 10, "group": "torsion"}
-    return limit(*words, left, -TORSION_SLACK_M, **how)
+    options = {"scale": MOMENT_ARM_M / 10, "group": "torsion"}
+    return limit(*words, left, -TORSION_SLACK_M, **options)
 
 
 def reserve(m: Mode) -> list[Term]:

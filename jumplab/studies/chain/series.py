@@ -35,21 +35,21 @@ def run_chains(
     ranges: Ranges = SLIGHT,
     noise: SensorNoise | None = None,
     jobs: int | None = None,
-    **how: Any,
+    **arguments: Any,
 ) -> Plain:
     """Let ``n`` robots jump the course, drawn by the seeds ``seed``, ``seed + 1``, and so on.
 
-    ``ranges`` and ``noise`` are those of :meth:`jumplab.sim.Perturbation.draw`, ``how`` further
-    arguments of :func:`run_chain`. With more than one of ``jobs`` processes (one per core if None),
-    what planning takes is measured beside the others' work. Returns the :func:`counts` of all
-    robots, the course as ``target``, and one :func:`row` per robot in ``trials``.
+    ``ranges`` and ``noise`` are those of :meth:`jumplab.sim.Perturbation.draw`, ``arguments``
+    further ones of :func:`run_chain`. With more than one of ``jobs`` processes (one per core if
+    None), what planning takes is measured beside the others' work. Returns the :func:`counts` of
+    all robots, the course as ``target``, and one :func:`row` per robot in ``trials``.
     """
     check_numbers(n, seed, jobs)
-    planner = how.pop("planner", None) or Planner(crouched(robot), keep=True)
+    planner = arguments.pop("planner", None) or Planner(crouched(robot), keep=True)
     work = []
     for number in range(seed, seed + n):
         drawn = Perturbation.draw(robot, number, ranges, noise or SensorNoise())
-        work.append(joblib.delayed(_trial)(course, robot, planner, number, drawn, how))
+        work.append(joblib.delayed(_trial)(course, robot, planner, number, drawn, arguments))
     trials = list(in_parallel(work, jobs, "generator"))
     return {"target": course.to_json()} | counts(trials) | {"trials": trials}
 
@@ -82,30 +82,30 @@ def counts(rows: Sequence[Plain]) -> Plain:
     plans that were made on the way and were there when they were needed, and of jumps that began
     without waiting for a plan; and the largest error of the robots that stood [m].
     """
-    stood = [x for x in rows if x["stood"]]
+    standing = [x for x in rows if x["stood"]]
     spare_s = [plan["spare_s"] for x in rows for plan in x["plans"]]
     waits_s = [wait_s for x in rows for wait_s in x["waits_s"]]
     return {
         "runs": len(rows),
         "confidence": CONFIDENCE,
-        "stood": len(stood),
-        "interval": wilson(len(stood), len(rows)),
+        "stood": len(standing),
+        "interval": wilson(len(standing), len(rows)),
         "replans": len(spare_s),
         "in_time": sum(spare is not None and spare >= 0 for spare in spare_s),
         "jumps": len(waits_s),
         "begun_without_waiting": sum(wait_s <= 0 for wait_s in waits_s),
-        "largest_error_m": max((abs(e) for x in stood for e in x["errors_m"]), default=None),
+        "largest_error_m": max((abs(e) for x in standing for e in x["errors_m"]), default=None),
     }
 
 
 def _trial(
-    course: Course, robot: Robot, planner: Planner, seed: int, drawn: Perturbation, how: Plain
+    course: Course, robot: Robot, planner: Planner, seed: int, drawn: Perturbation, arguments: Plain
 ) -> Plain:
     planner = here(planner)
-    rehearsal = _rehearsed(course, planner, how.get("method", USUAL))
+    rehearsal = _rehearsed(course, planner, arguments.get("method", USUAL))
     given = dict(planner=planner, rehearsal=rehearsal, perturbation=drawn)
     try:
-        result = run_chain(course, robot, **given, **how)
+        result = run_chain(course, robot, **given, **arguments)
     # the engine lost the robot: a failure like any other, and counted as one
     except SolverError as e:
         return {"seed": seed, "stood": False, "reason": str(e)} | dict.fromkeys(PER_JUMP, ())
