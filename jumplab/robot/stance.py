@@ -21,7 +21,7 @@ WIDTH_WEIGHT = 1e-3  # of the feet's distance in the neutral posture, which a ro
 # [m, rad] that a standing posture may miss: a leg of five joints whose sides differ
 STANDS_M = 1e-3
 CHANGE_STANCE = "change [stance] in its configuration"
-# [rad] knees and trunks of postures that are tried where the one that was told cannot stand
+# [rad] knees and trunks of postures that are tried where the stance of a robot cannot be reached
 OTHER_STANCES = ((0.3, 0.0), (0.3, 0.2), (0.8, 0.05), (0.8, 0.25), (1.2, 0.1), (1.2, 0.3))
 
 
@@ -194,7 +194,9 @@ def knees(robot: Robot) -> list[tuple[int, float, float]]:
 
 
 def rest_angles(robot: Robot) -> np.ndarray:
-    """Angles (nv - 6,) [rad] told for the standing posture, else 0 or well inside the range."""
+    """Angles (nv - 6,) [rad] of the standing posture: those of [rest], else 0; well inside the
+    range.
+    """
     low = robot.limits.lower
     high = robot.limits.upper
     room = np.minimum(2 * STANCE_ROOM_RAD, (high - low) / 3)
@@ -204,7 +206,7 @@ def rest_angles(robot: Robot) -> np.ndarray:
 
 def standing(robot: Robot) -> np.ndarray:
     """Pinocchio configuration (nq,) with flat feet that point ahead, the CoM above them, knees and
-    trunk as told.
+    trunk as in [stance].
 
     Raises :class:`RobotError` if the legs reach no such posture within their ranges.
     """

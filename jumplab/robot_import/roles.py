@@ -50,7 +50,7 @@ SHORTEST_LEG = 0.15  # share of the robot's height: shorter ones are fingers
 TOES = 0.25  # of a shank: joints farther beyond the ankle are of the toes
 FOOT_LIKE = 0.6  # a pitch joint this near the one before it, in shanks, is of the toes
 SAME_M = 0.02  # how far from mirror images two limbs may stand
-# ranges of joints that turn without stops, or whose stops nobody told: a person's, nearly
+# ranges of joints that turn without stops, or whose stops are not in the file: a person's, nearly
 ASSUMED_RAD = {
     "hip_pitch": (-2.0, 0.6),
     "knee": (0.0, 2.3),
