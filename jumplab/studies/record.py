@@ -54,7 +54,7 @@ CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
 # at the nodes, of the best; halvings of the share between the largest plan and what has none
 HALVINGS = 5
-HALVING_S = 3e-3  # processor time of each, per unknown of the program [s]
+HALVING_S = 6e-3  # processor time of each, per unknown of the program [s]
 LESS = 0.05  # of the share of a record that is played next, where a robot falls
 TRIED = 5  # shares that are played
 NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds
@@ -397,7 +397,8 @@ class _Search:
                 if share == 1:  # finer meshes may allow less
                     body = self.stage.refined(program, Asked(self.task, near=best), RECORD)
                 else:
-                    near = best if accepted is None else accepted[1]
+                    # a record without a plan may be a motion that leads its shares nowhere
+                    near = None if accepted is None else accepted[1]
                     with patience(max(LEAST_S, min(left_s(), HALVING_S * program.size))):
                         body = self.stage.plan(self.at(self.task, share), near=near)
                 plan = JumpPlan.of(robot, "direct", body)
