@@ -400,7 +400,7 @@ class _Search:
                     # a record without a plan may be a motion that leads its shares nowhere
                     near = None if accepted is None else accepted[1]
                     with patience(max(LEAST_S, min(left_s(), HALVING_S * program.size))):
-                        body = self.stage.plan(self.at(self.task, share), near=near)
+                        body = self.stage.plan(self.below(share), near=near)
                 plan = JumpPlan.of(robot, "direct", body)
                 failed = ", ".join(check.name for check in plan.audit.failed)
             except (InfeasibleError, SolverError) as e:
@@ -430,6 +430,15 @@ class _Search:
     def at(self, task: JumpTask, share: float) -> JumpTask:
         """A ``share`` [1] of what is sought; of a jump onto a platform the rise stays."""
         return replace(task, **{self.what: share * getattr(task, self.what)})
+
+    def below(self, share: float) -> JumpTask:
+        """A ``share`` [1] of the record. A rise that was sought too goes to the usual one as the
+        share goes to zero: at the record's rise, smaller shares may have no plan either.
+        """
+        task = self.at(self.task, share)
+        if "takeoff_speed" not in self.sought:
+            return task
+        return replace(task, height_m=share * task.height_m + (1 - share) * self.given.height_m)
 
     def played(
         self, plan: JumpPlan, share: float, engines: Sequence[str]
