@@ -9,7 +9,7 @@ import pytest
 
 import jumplab as jl
 from jumplab.cli.main import main
-from jumplab.errors import InfeasibleError, InputError
+from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.ocp import Bound, Nlp, Phase, PhaseGuess, Problem, Term
 from jumplab.ocp.nlp import patience
 from jumplab.robot_import.urdf import have_published
@@ -109,6 +109,30 @@ def test_where_an_easy_jump_is_not_easy_half_of_it_is_the_start(bhr, monkeypatch
         found = jl.record(bhr, "height_m", jl.JumpTask(0.3, 0.2), engines=())
     first, half, *_ = found.found.values()
     assert np.isnan(first) and half > 0.9 and found.audit.passed
+
+
+def test_where_no_finer_mesh_has_a_plan_shares_are_planned_afresh_and_less_high(bhr, monkeypatch):
+    """Of what is sought, and of the rise above the usual 0.2 m, each share is the same."""
+    stage, asked = type(jl.Planner(bhr).stage("direct")), []
+    refined, plan = stage.refined, stage.plan
+
+    def without_the_record(self, program, given, start):
+        if start is study.RECORD:
+            raise SolverError("no plan on a finer mesh")
+        return refined(self, program, given, start)
+
+    def noted(self, task, *given, **options):
+        if "near" in options:
+            asked.append((task.platform_m, task.height_m - 0.2, options["near"]))
+        return plan(self, task, *given, **options)
+
+    monkeypatch.setattr(stage, "refined", without_the_record)
+    monkeypatch.setattr(stage, "plan", noted)
+    found = jl.record(bhr, "platform_m", engines=())
+    platforms, rises, near = zip(*asked, strict=True)
+    assert found.audit.passed and found.value == max(x for x in platforms if x <= found.value) < found.best
+    assert len(asked) == study.HALVINGS and platforms[0] == pytest.approx(found.best / 2) and near[0] is None
+    assert np.divide(rises, platforms) == pytest.approx(rises[0] / platforms[0]) and rises[0] > 0
 
 
 def test_a_record_that_only_a_number_of_the_problem_ends_is_refused_in_a_sentence(bhr):

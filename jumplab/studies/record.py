@@ -54,7 +54,8 @@ CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
 # at the nodes, of the best; halvings of the share between the largest plan and what has none
 HALVINGS = 5
-HALVING_S = 6e-3  # processor time of each, per unknown of the program [s]
+# processor time of each, per unknown of the program [s]; a whole G1 takes 15 to 30 s from nothing
+HALVING_S = 6e-3
 LESS = 0.05  # of the share of a record that is played next, where a robot falls
 TRIED = 5  # shares that are played
 NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds

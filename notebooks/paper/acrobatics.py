@@ -38,7 +38,7 @@ KINDS = "ahead", "side", "quarter turn", "half turn", "platform", "flip", "weake
 TARGETS = 14, 9, 9, 9, 9  # of the first kinds
 FAR = 3.0  # times the rise, the farthest that is asked: shallower jumps slip
 PERTURBED = 100  # robots, of each flip in :data:`THROWN`
-# a backflip of 0.4 m leaves little time to turn over: in MuJoCo 4 of 12 robots that differ stand, after this one 10
+# lower ones leave robots that differ from their model little time to turn over
 THROWN = ("backflip, 0 m ahead, 0.5 m up", "front flip, 0.1 m ahead, 0.5 m up")
 COLUMNS = {
     "kind": "kind",

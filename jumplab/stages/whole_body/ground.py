@@ -120,19 +120,18 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
     toes = float(body.places[:, 0].mean())
     length = 2 * body.half_m
     if contacts.over:
-        first, last, top = contacts.over
-        n_initial = len(contacts.first)
-        for i, place in enumerate(contacts.places):
-            ends = place.ahead_m - length, place.ahead_m
-            if ends[0] < last and first < ends[1] and not contacts.is_aimed(n_initial + i):
-                phase, side = contacts.landings[n_initial + i]
+        begin, end, top = contacts.over
+        places = [*contacts.first, *contacts.places]
+        for i, (place, (phase, side)) in enumerate(zip(places, contacts.landings, strict=True)):
+            heel, toe = place.ahead_m - length, place.ahead_m
+            if heel < end and begin < toe and not contacts.is_aimed(i):
                 raise InputError(
                     f"phase {contacts.phases[phase].name!r}: the {SIDES[side]} foot would come "
-                    f"down from {ends[0]:.2f} to {ends[1]:.2f} m, on the block from {first:.2f} to "
-                    f"{last:.2f} m; make its ahead_m at most {first:.2f} m, or at least "
-                    f"{last + length:.2f} m"
+                    f"down from {heel:.2f} to {toe:.2f} m, on the block from {begin:.2f} to "
+                    f"{end:.2f} m; make its ahead_m at most {begin:.2f} m, or at least "
+                    f"{end + length:.2f} m"
                 )
-        return Surface(over=(toes + first, toes + last, top))
+        return Surface(over=(toes + begin, toes + end, top))
     if height == 0:
         return Surface()
     leaving = toes + max(before)
