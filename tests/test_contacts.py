@@ -286,7 +286,7 @@ def test_a_block_lies_ahead_on_level_ground(bhr):
     under = replace(over, over=(last, last + 0.5, top))
     with pytest.raises(InputError, match=r"foot would come down from .*, on the block from .*; make its ahead_m"):
         surface_of_schedule(Body(bhr), Limits(), under, JumpTask(0.0, 0.2))
-    with pytest.raises(InputError, match=r"the left foot would come down from -0\.\d+ to 0\.00 m, on the block from -0\.10"):
+    with pytest.raises(InputError, match=r"the left foot would come down from -0.* to 0\.00 m, on the block"):
         surface_of_schedule(Body(bhr), Limits(), replace(over, over=(-0.1, last, top)), JumpTask(0.0, 0.2))
     lower = tuple(replace(place, up_m=-0.1) for place in over.places[1:])
     with pytest.raises(InputError, match="a block lies on level ground"):
