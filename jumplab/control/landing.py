@@ -18,7 +18,7 @@ from jumplab.control.kinematics import Gauge
 from jumplab.control.step import RecoveryStep
 from jumplab.ocp.qp import Qp
 from jumplab.robot import Robot
-from jumplab.robot.stance import stance_configuration
+from jumplab.robot.stance import leg_length, lowered_m, stance_configuration
 from jumplab.stages.srmp.landing import LandingPlan
 
 CONTACT_FORCE_N = 10.0  # a foot stands if it carries more than 2.5 % of the weight ...
@@ -147,7 +147,11 @@ class LandingController:
         rest = stance_configuration(robot)
         self._rest = rest[7:]
         self._rest_pitch = float(robot.stance["trunk_pitch_rad"])
-        self._height = float(Gauge(robot).com(rest)[2])  # above the soles
+        gauge = Gauge(robot)
+        self._height = float(gauge.com(rest)[2])  # above the soles
+        self._leg_m = leg_length(robot)
+        left, right = gauge.places(rest)
+        self._apart_m = float(np.linalg.norm((left.translation - right.translation)[:2]))
         self.reference = reference
 
     def torque(
@@ -203,7 +207,10 @@ class LandingController:
         body = self.body
         qp = body.program(v, self._corners, leaning=self._leaning)
         ground = body.soles[contact] if contact.any() else body.soles
-        com_wish, momentum_wish = self._balance(time, ground.mean(axis=0))
+        middle = ground.mean(axis=0)
+        if contact.all():
+            middle[2] -= self._lower_m()
+        com_wish, momentum_wish = self._balance(time, middle)
         if self.step.side is not None:
             com_wish[:2] = self.step.com_acceleration(body)
         on = float(contact.any())  # in the air neither CoM nor momentum can be asked for
@@ -221,6 +228,14 @@ class LandingController:
         qp.cost("posture", body.unknowns[6:-12], *self.posture_wish(q, v))
         qp.cost("effort", self._effort_rows, 0.0, self._effort_weight)
         return qp
+
+    def _lower_m(self) -> float:
+        """By how much the robot stands lower where its feet are further apart than in the stance
+        [m]: legs that are straight cannot keep it from falling aside.
+        """
+        left, right = self.body.soles[:, :2]
+        apart = np.linalg.norm(left - right)
+        return lowered_m(self._leg_m, np.sqrt(max(apart**2 - self._apart_m**2, 0.0)))
 
     def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Wished CoM acceleration (3,) and rate of angular momentum (3,)."""

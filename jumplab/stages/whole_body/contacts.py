@@ -34,6 +34,10 @@ LONGER = 0.9
 # of the leg, from the toes to a block ahead of them, and from it to the heels beyond; its length
 BEFORE_BLOCK = 0.3
 BLOCK_M = 0.05
+# beyond it, where a robot that stops over one foot falls if it differs from its model: the other
+# foot comes down so soon [sqrt(leg / g)], and by so many steps ahead
+RUN_ON = (0.4, 1.3, 1.04)
+RUN_ON_STEPS = 1.3
 FREE_SHARE = 0.5  # of it, by which those before a target may be longer or shorter
 
 
@@ -355,8 +359,8 @@ class Contacts:
 
     @classmethod
     def hurdle(cls, robot: Robot, height_m: float = 0.0, step_m: float | None = None) -> Contacts:
-        """A leap that goes farther, ``step_m`` [m] as there; over a block of ``height_m`` [m] in
-        the middle of it, if that is not 0.
+        """A leap that goes farther, ``step_m`` [m] as there; if ``height_m`` is not 0, over a block
+        so high [m] in the middle of it, and on by a step.
         """
         if height_m == 0:
             return cls.leap(robot, step_m, share=2.8)
@@ -364,7 +368,13 @@ class Contacts:
         gap = BEFORE_BLOCK * leg_length(robot)
         block = d + gap, d + gap + BLOCK_M, height_m
         landed = block[1] + gap + robot.foot.toe - robot.foot.heel
-        return replace(cls.leap(robot, d, share=landed / d), over=block)
+        leap = cls.leap(robot, d, share=landed / d)
+        step, down, _ = leap.places
+        on = replace(down, ahead_m=landed + RUN_ON_STEPS * d)
+        low, high, guess = (x * math.sqrt(leg_length(robot) / robot.gravity) for x in RUN_ON)
+        *before, alone, last = leap.phases
+        alone = replace(alone, time_s=(low, high), guess_s=guess)
+        return replace(leap, phases=(*before, alone, last), places=(step, down, on), over=block)
 
     @classmethod
     def bound(cls, robot: Robot, jumps: int = 2, jump_m: float | None = None) -> Contacts:

@@ -244,6 +244,9 @@ def _path(schedule: Schedule, task: JumpTask, starts: np.ndarray) -> tuple[np.nd
     above = []
     for feet in footholds(schedule, task):
         x, y, z, yaw = np.mean([*feet.values()], axis=0) if feet else np.zeros(4)
+        if len(feet) == len(SIDES):
+            # legs bend so much that the base need not be in the middle yet
+            z -= (feet[0][0] - feet[1][0]) ** 2 / body.leg_m
         above.append(np.array([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw, z]))
     times = [0.0]
     keys = [np.array([*body.stance[:2], 0.0, 0.0])]

@@ -177,7 +177,7 @@ class Schedule:
         swinging = [side for side in self.free.sides if side not in m.modes]
         terms += [swing_rows(m, side, self.follows) for side in swinging]
         if self.contacts.over and len(m.modes) < len(SIDES):
-            terms.append(over_block(m, self.contacts.over))
+            terms.append(over_block(m, self.contacts.over, self._beside_block_m()))
         if m.flying:
             terms += opening_rows(m)
         if self.tracking:
@@ -207,6 +207,14 @@ class Schedule:
         if last and self.sought:
             terms.append(largest(self.sought[0]))
         return terms
+
+    def _beside_block_m(self) -> float:
+        """Least distance of a foothold from the schedule's block [m]."""
+        begin, end, _ = self.contacts.over
+        length = 2 * self.body.half_m
+        places = (*self.contacts.first, *self.contacts.places)
+        known = [x.ahead_m for i, x in enumerate(places) if not self.contacts.is_aimed(i)]
+        return min(max(begin - toe, toe - length - end) for toe in known)
 
     def _phase(self, k: int) -> Phase:
         mode = self.modes[k]

@@ -46,6 +46,10 @@ WORTH = 1000.0
 
 Contact = tuple[int, int]  # number of its phase, side
 
+# of the way from a foothold to a block: it rises from there on, and at most so much is level
+SLOPE_SHARE = 0.95
+SLOPE_LEVEL = 0.2
+SLOPE_ROUND = 0.02  # of the slope's corner on the ground
 CLEAR = {"scale": PLACE_SCALE, "group": "clearance"}
 
 
@@ -187,25 +191,30 @@ def body_clearance(m: Mode) -> Term:
     return limit(*words, heights, least, skip=(1, 0), **CLEAR)
 
 
-def over_block(m: Mode, over: tuple[float, float, float]) -> Term:
-    """Shanks, knees and soles in the air stay above a block (from, to, top), ahead of the toes'
-    first place [m]; it counts as longer, and higher, since feet move on between the nodes.
+def over_block(m: Mode, over: tuple[float, float, float], beside_m: float) -> Term:
+    """Hands, knees, shanks, and soles in the air stay above a block (from, to, top), ahead of the
+    toes' first place [m], and above slopes that lead up to it and down again from footholds that
+    are ``beside_m`` [m] away: links move on between the nodes, at the height of neither.
     """
     body = m.body
     lim = m.limits
     first, last, top = over
-    begins = float(body.places[:, 0].mean()) + first - lim.edge_step_m
-    ends = begins + last - first + 2 * lim.edge_step_m
+    middle = float(body.places[:, 0].mean()) + (first + last) / 2
+    level = min(lim.edge_step_m / 2, SLOPE_LEVEL * beside_m)  # beyond the block, before it slopes
+    half = (last - first) / 2 + level
+    slope = SLOPE_SHARE * beside_m - level
     face = body.shank_m + lim.clearance_m
     spots = [(spot, face) for spot in (*body.limb_points[:2], *body.shank_points)]
+    spots += [(spot, lim.body_clearance_m) for spot in body.limb_points[2:]]
     for side in {0, 1} - set(m.modes):
         toes, heels = np.split(body.corners[side], 2)
         sole = [toes + share * (heels - toes) for share in SOLE_SHARES[::2]]
         spots += [((body.feet[side], x), lim.clearance_m) for x in np.concatenate(sole)]
 
     def inside(x):
-        smooth = 2 * lim.edge_smoothing_m
-        return (ca.tanh((x - begins) / smooth) - ca.tanh((x - ends) / smooth)) / 2
+        away = ca.sqrt((x - middle) ** 2 + lim.edge_smoothing_m**2) - half
+        share = 1 - away / slope
+        return (share + ca.sqrt(share**2 + SLOPE_ROUND**2)) / 2
 
     def heights(p):
         points = [(p.tree.point(*spot), room) for spot, room in spots]
