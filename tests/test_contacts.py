@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -10,11 +12,14 @@ from jumplab.errors import InputError
 from jumplab.ocp.layout import layouts
 from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
-from jumplab.stages.whole_body import ContactPhase, Contacts, Limits, Mesh, Place, Weights
+from jumplab.stages.whole_body import ContactPhase, Contacts, Limits, Mesh, Place, Weights, motions
 from jumplab.stages.whole_body.body import Body
-from jumplab.stages.whole_body.contacts import INTERVALS, STEP_SHARE, TIMES, jump_contacts
+from jumplab.stages.whole_body.contacts import INTERVALS, RUN_ON_STEPS, STEP_SHARE, TIMES, jump_contacts
+from jumplab.stages.whole_body.coordinates import whole
 from jumplab.stages.whole_body.ground import surface_of_schedule
+from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.terms import over_block
 from jumplab.task import JumpTask
 
 LEAP = "LR L lR R r - L LR"
@@ -182,6 +187,35 @@ def test_footholds_are_one_unknown_in_all_phases_of_a_contact(bhr):
     assert at["1 LR"]["right_x"] != at["3 LR"]["right_x"]
 
 
+@pytest.mark.parametrize("beside", (0.0, 0.05, 0.25))
+def test_the_roof_over_a_block_covers_it_and_ends_before_the_footholds(bhr, beside):
+    """The block, whatever the distance of the footholds; these where they are not right at the block."""
+    first, last, top = block = (0.4, 0.45, 0.2)
+    body, limits = Body(bhr), Limits()
+    term = over_block(Mode(body, limits, Weights(), "-", whole(body)), block, beside)
+
+    def height(ahead: float) -> np.ndarray:
+        """That each link needs."""
+        place = ca.DM([float(body.places[:, 0].mean()) + ahead, 0.0, 0.0])
+        below = SimpleNamespace(tree=SimpleNamespace(point=lambda *spot: place))
+        return term.lower - np.array(term.expression(below)).ravel()
+
+    over = np.array([height(x) for x in np.linspace(first, last, 6)])
+    assert over.min() > top and over.max() < 2 * (top + limits.body_clearance_m + body.shank_m)
+    down = np.array([height(last + x) for x in np.linspace(0.0, 0.5, 50)])
+    assert (np.diff(down, axis=0) < 1e-4).all() and down[-1].max() < 1e-3
+    if beside > 0.1:
+        assert max(height(first - beside).max(), height(last + beside).max()) < 2e-3  # a sole can stand there
+
+
+def test_starts_reach_feet_that_end_apart_and_turns_keep_their_height(bhr):
+    schedule = Schedule(Body(bhr), Contacts.hurdle(bhr, 0.2), Limits(), Weights())
+    assert motions.along(schedule, JumpTask(0.0, 0.2)).missed < motions.REACHED
+    jump = Schedule(Body(bhr), jump_contacts(Limits(), Mesh()), Limits(), Weights())
+    straight, turned = (motions.along(jump, JumpTask(0.0, 0.2, yaw_rad=yaw)).charts[-1] for yaw in (0.0, np.pi / 2))
+    np.testing.assert_allclose(turned[:, 2], straight[:, 2], atol=1e-9)
+
+
 # refused ------------------------------------------------------------------------------------------
 WRITE = "write L and R for flat feet, l and r for toes, left before right, or '-' for flight"
 WAIT = "a schedule must begin at rest on flat feet, where the robot can wait; begin with 'LR'"
@@ -277,7 +311,10 @@ def test_a_block_lies_ahead_on_level_ground(bhr):
     assert letters(over) == LEAP
     first, last, top = over.over
     step, sole = STEP_SHARE * leg_length(bhr), bhr.foot.toe - bhr.foot.heel
-    assert top == 0.2 and step < first < last < over.places[-1].ahead_m - sole
+    _, down, on = over.places
+    assert top == 0.2 and step < first < last < down.ahead_m - sole
+    assert on.ahead_m - down.ahead_m == pytest.approx(RUN_ON_STEPS * step)  # it does not stop over one foot
+    assert over.phases[-2].time_s[1] < 0.5 * Contacts.leap(bhr).phases[-2].time_s[1]
     for wrong in ((0.5, 0.4, 0.2), (0.4, 0.5), (0.4, np.nan, 0.2), (0.4, 0.5, np.inf), (0.4, 0.5, -0.1)):
         with pytest.raises(InputError, match="over"):
             replace(over, over=wrong)

@@ -72,6 +72,10 @@ def test_a_hurdle_clears_its_block():
     toes = robot.foot.toe - float(robot.foot.center[0])
     assert scene.top_at(toes + (first + last) / 2) == 0.2
     assert scene.top_at(toes + first - 0.01) == scene.top_at(toes + last + 0.01) == 0
+    run = jl.simulate(plan)
+    assert run.landed, run.reason
+    bent = [robot.joint_names.index(name) for name in robot.joints["knee"]]
+    assert run.q[-1, 7:][bent].min() > 0.15  # feet apart ask for a lower stand, not for straight legs
 
 
 def test_its_attempts_say_what_was_tried():

@@ -18,7 +18,7 @@ from jumplab.control.kinematics import Gauge
 from jumplab.control.step import RecoveryStep
 from jumplab.ocp.qp import Qp
 from jumplab.robot import Robot
-from jumplab.robot.stance import leg_length, lowered_m, stance_configuration
+from jumplab.robot.stance import leg_length, stance_configuration
 from jumplab.stages.srmp.landing import LandingPlan
 
 CONTACT_FORCE_N = 10.0  # a foot stands if it carries more than 2.5 % of the weight ...
@@ -150,8 +150,8 @@ class LandingController:
         gauge = Gauge(robot)
         self._height = float(gauge.com(rest)[2])  # above the soles
         self._leg_m = leg_length(robot)
-        left, right = gauge.places(rest)
-        self._apart_m = float(np.linalg.norm((left.translation - right.translation)[:2]))
+        left, right = (foot.act(robot.foot.center)[:2] for foot in gauge.places(rest))
+        self._apart_m = float(np.linalg.norm(left - right))
         self.reference = reference
 
     def torque(
@@ -230,12 +230,12 @@ class LandingController:
         return qp
 
     def _lower_m(self) -> float:
-        """By how much the robot stands lower where its feet are further apart than in the stance
-        [m]: legs that are straight cannot keep it from falling aside.
+        """By how much hips are lower over feet that stand further apart than in the stance, on legs
+        as long as there [m]: legs that are straight cannot keep the robot from falling aside.
         """
         left, right = self.body.soles[:, :2]
-        apart = np.linalg.norm(left - right)
-        return lowered_m(self._leg_m, np.sqrt(max(apart**2 - self._apart_m**2, 0.0)))
+        further = max(np.sum((left - right) ** 2) - self._apart_m**2, 0.0)
+        return self._leg_m - np.sqrt(max(self._leg_m**2 - further / 4, 0.0))
 
     def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Wished CoM acceleration (3,) and rate of angular momentum (3,)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -163,13 +162,6 @@ def leg_length(robot: Robot) -> float:
     hip = data.oMi[model.getJointId(robot.joints["hip_pitch"][0])]
     foot, _ = on_feet(robot, robot.foot.center)
     return float(hip.translation[2] - foot.place(data).translation[2])
-
-
-def lowered_m(leg_m: float, apart_m: float) -> float:
-    """By how much the hips are lower over feet that stand ``apart_m`` [m] further apart than in the
-    stance, on legs of ``leg_m`` [m] as there.
-    """
-    return leg_m - math.sqrt(max(leg_m**2 - apart_m**2 / 4, 0.0))
 
 
 # robots that need space

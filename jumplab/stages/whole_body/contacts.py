@@ -34,10 +34,10 @@ LONGER = 0.9
 # of the leg, from the toes to a block ahead of them, and from it to the heels beyond; its length
 BEFORE_BLOCK = 0.3
 BLOCK_M = 0.05
-# beyond it, where a robot that stops over one foot falls if it differs from its model: the other
-# foot comes down so soon [sqrt(leg / g)], and by so many steps ahead
+# natural time on one foot beyond it, as of :data:`TIMES`: a robot that differs from its model and
+# stops over one foot falls
 RUN_ON = (0.4, 1.3, 1.04)
-RUN_ON_STEPS = 1.3
+RUN_ON_STEPS = 1.3  # of usual length, by which the other foot comes down ahead of that one
 FREE_SHARE = 0.5  # of it, by which those before a target may be longer or shorter
 
 

@@ -241,12 +241,15 @@ def _path(schedule: Schedule, task: JumpTask, starts: np.ndarray) -> tuple[np.nd
     """Times (m,) [s], and x, y, yaw of the base and by how much it is higher (m, 4) then."""
     body = schedule.body
     ahead = body.stance[0] - body.places[:, 0].mean()
+    width = np.sum((body.places[0] - body.places[1])[:2] ** 2)
     above = []
     for feet in footholds(schedule, task):
         x, y, z, yaw = np.mean([*feet.values()], axis=0) if feet else np.zeros(4)
         if len(feet) == len(SIDES):
-            # legs bend so much that the base need not be in the middle yet
-            z -= (feet[0][0] - feet[1][0]) ** 2 / body.leg_m
+            # over feet further apart than in the stance, legs bend so much that they reach both
+            # from above one of them
+            further = np.sum((feet[0] - feet[1])[:2] ** 2) - width
+            z -= max(further, 0.0) / body.leg_m
         above.append(np.array([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw, z]))
     times = [0.0]
     keys = [np.array([*body.stance[:2], 0.0, 0.0])]

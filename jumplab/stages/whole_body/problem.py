@@ -209,12 +209,15 @@ class Schedule:
         return terms
 
     def _beside_block_m(self) -> float:
-        """Least distance of a foothold from the schedule's block [m]."""
+        """Least distance of a foothold from the schedule's block [m]; of one that the target
+        places, a usual one.
+        """
         begin, end, _ = self.contacts.over
         length = 2 * self.body.half_m
         places = (*self.contacts.first, *self.contacts.places)
         known = [x.ahead_m for i, x in enumerate(places) if not self.contacts.is_aimed(i)]
-        return min(max(begin - toe, toe - length - end) for toe in known)
+        away = [max(begin - toe, toe - length - end) for toe in known]
+        return min(away + [self.limits.edge_step_m] * self.contacts.aimed)
 
     def _phase(self, k: int) -> Phase:
         mode = self.modes[k]

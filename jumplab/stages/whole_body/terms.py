@@ -46,10 +46,9 @@ WORTH = 1000.0
 
 Contact = tuple[int, int]  # number of its phase, side
 
-# of the way from a foothold to a block: it rises from there on, and at most so much is level
-SLOPE_SHARE = 0.95
-SLOPE_LEVEL = 0.2
-SLOPE_ROUND = 0.02  # of the slope's corner on the ground
+ROOF_ENDS = 0.95  # of the way from a block to the nearest foothold, where the roof over it ends
+ROOF_HIGH = 0.2  # of that way, up to where the roof is at least as high as the block
+ROOF_ROUND = 0.02  # of the block's height, by which the roof's end is rounded
 CLEAR = {"scale": PLACE_SCALE, "group": "clearance"}
 
 
@@ -192,17 +191,18 @@ def body_clearance(m: Mode) -> Term:
 
 
 def over_block(m: Mode, over: tuple[float, float, float], beside_m: float) -> Term:
-    """Hands, knees, shanks, and soles in the air stay above a block (from, to, top), ahead of the
-    toes' first place [m], and above slopes that lead up to it and down again from footholds that
-    are ``beside_m`` [m] away: links move on between the nodes, at the height of neither.
+    """Hands, knees, shanks, and soles in the air stay above a roof over a block (from, to, top),
+    ahead of the toes' first place [m], that ends short of footholds ``beside_m`` [m] away. Over a
+    flat top, links pass through the block between two nodes.
     """
     body = m.body
     lim = m.limits
     first, last, top = over
     middle = float(body.places[:, 0].mean()) + (first + last) / 2
-    level = min(lim.edge_step_m / 2, SLOPE_LEVEL * beside_m)  # beyond the block, before it slopes
-    half = (last - first) / 2 + level
-    slope = SLOPE_SHARE * beside_m - level
+    smooth = lim.edge_smoothing_m
+    beyond = max(min(lim.edge_step_m / 2, ROOF_HIGH * beside_m), smooth)
+    half = (last - first) / 2 + beyond  # of the part that is at least as high as the block
+    slope = max(ROOF_ENDS * beside_m - beyond, 2 * half)  # steeper, its ridge is out of reach
     face = body.shank_m + lim.clearance_m
     spots = [(spot, face) for spot in (*body.limb_points[:2], *body.shank_points)]
     spots += [(spot, lim.body_clearance_m) for spot in body.limb_points[2:]]
@@ -211,14 +211,13 @@ def over_block(m: Mode, over: tuple[float, float, float], beside_m: float) -> Te
         sole = [toes + share * (heels - toes) for share in SOLE_SHARES[::2]]
         spots += [((body.feet[side], x), lim.clearance_m) for x in np.concatenate(sole)]
 
-    def inside(x):
-        away = ca.sqrt((x - middle) ** 2 + lim.edge_smoothing_m**2) - half
-        share = 1 - away / slope
-        return (share + ca.sqrt(share**2 + SLOPE_ROUND**2)) / 2
+    def roof(x):
+        share = 1 - (ca.sqrt((x - middle) ** 2 + smooth**2) - half) / slope
+        return (share + ca.sqrt(share**2 + ROOF_ROUND**2)) / 2
 
     def heights(p):
         points = [(p.tree.point(*spot), room) for spot, room in spots]
-        return ca.vertcat(*(x[2] - (top + room) * inside(x[0]) for x, room in points))
+        return ca.vertcat(*(x[2] - (top + room) * roof(x[0]) for x, room in points))
 
     return limit("over the block", "ours", "m", "node", heights, -lim.link_distance_m, **CLEAR)
 
