@@ -208,9 +208,11 @@ def test_the_roof_over_a_block_covers_it_and_ends_before_the_footholds(bhr, besi
         assert max(height(first - beside).max(), height(last + beside).max()) < 2e-3  # a sole can stand there
 
 
-def test_starts_reach_feet_that_end_apart_and_turns_keep_their_height(bhr):
+def test_starts_are_lower_over_feet_apart_alone(bhr):
     schedule = Schedule(Body(bhr), Contacts.hurdle(bhr, 0.2), Limits(), Weights())
     assert motions.along(schedule, JumpTask(0.0, 0.2)).missed < motions.REACHED
+    stood = motions.along(Schedule(Body(bhr), Contacts.of("LR", bhr), Limits(), Weights()), JumpTask(0.0, 0.2))
+    np.testing.assert_allclose(stood.charts[0][:, 2], Body(bhr).stance[2], atol=1e-9)
     jump = Schedule(Body(bhr), jump_contacts(Limits(), Mesh()), Limits(), Weights())
     straight, turned = (motions.along(jump, JumpTask(0.0, 0.2, yaw_rad=yaw)).charts[-1] for yaw in (0.0, np.pi / 2))
     np.testing.assert_allclose(turned[:, 2], straight[:, 2], atol=1e-9)
