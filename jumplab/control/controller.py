@@ -26,6 +26,7 @@ from jumplab.control.landing import LandingController
 from jumplab.control.launch import LaunchFeedback, check_mode
 from jumplab.control.playback import Command, Playback, check_tape
 from jumplab.control.reaim import Reaim
+from jumplab.control.rebound import Rebounds, passages
 from jumplab.control.reference import LEAD_S, LandingAhead
 from jumplab.control.servo import Drive, servo_of
 from jumplab.errors import InputError, quoted
@@ -100,7 +101,7 @@ class Controller:
     touchdown : step in which the feet come down that end the schedule, and the landing begins;
         None until then.
     ahead : what the landing controller follows, and why.
-    last_step : at which a robot that is still in the air is given up.
+    rebounds : flights before the last one, see :class:`.rebound.Rebounds`; None if there are none.
     """
 
     @checked
@@ -161,13 +162,26 @@ class Controller:
         self._settling = size.of(SETTLING_S, "s") / STEP_S
         touches_n = size.of(TOUCHDOWN_FORCE_N, "N")
         self._touches_n = max(touches_n, SURE * np.sqrt(2) * hardware.force_noise_n)
+        earlier = passages(robot, tape, tape.flights[: -1 if flies else None], ground, reaim)
+        limits = self._touches_n, hardware.force_noise_n
+        self.rebounds = Rebounds(robot, tape, self.playback, earlier, *limits) if earlier else None
         self._looks_from = round(_looks_from_s(tape, self._awaited) / STEP_S)
-        self.last_step = self.playback.steps + round(WAIT_S / STEP_S)
+
+    @property
+    def _late(self) -> int:
+        """Steps by which the robot is behind the tape."""
+        return 0 if self.rebounds is None else self.rebounds.late
+
+    @property
+    def last_step(self) -> int:
+        """Step at which a robot that is still in the air is given up."""
+        return self.playback.steps + self._late + round(WAIT_S / STEP_S)
 
     @property
     def solves(self) -> tuple[int, int]:
-        """QPs posed by the landing controller, and how many of them failed."""
-        return self.landing.solver.solves, self.landing.solver.failures
+        """QPs posed in torque mode, and how many of them failed."""
+        used = [self.landing] + ([] if self.rebounds is None else [self.rebounds.tracker])
+        return sum(x.solver.solves for x in used), sum(x.solver.failures for x in used)
 
     @property
     def steps_s(self) -> tuple[float, ...]:
@@ -220,18 +234,25 @@ class Controller:
             if self.feedback is not None:
                 self.feedback.begin(state.q)
         if self.touchdown is None:
-            if step < self._looks_from:
+            at = step - self._late
+            if at < self._looks_from:
                 return self._play(step, state)
-            if not self._touches(step, state):
-                fly = self._play if self.forecast is None else self._fly
-                return fly(step, state)
+            if not self._touches(at, state):
+                return self._play(step, state) if self.forecast is None else self._fly(at, state)
             state = self._touch(step, state)
         return self._land(step - self.touchdown, state)
 
     def _play(self, step: int, state: State) -> Command:
         """Before the last flight is under way."""
-        command = self.playback.command(step, *state[:2])
-        return command if self.feedback is None else self.feedback(step, command, state)
+        if self.rebounds is not None:
+            command = self.rebounds.command(step, state)
+            if command is not None:
+                return command
+        at = step - self._late
+        command = self.playback.command(at, *state[:2])
+        if self.feedback is None or (self.rebounds and self.rebounds.begun):
+            return command
+        return self.feedback(at, command, state)
 
     def _touches(self, step: int, state: State) -> bool:
         """Whether the feet that are awaited come down; beside one that stands, in time at least."""

@@ -80,7 +80,7 @@ class LandingGains:
     acceleration_weight: float = 1e-4
 
 
-GAINS = LandingGains()  # of a robot of size one
+GAINS = LandingGains()
 # their units, where a robot's size matters: natural frequencies, weights of angular accelerations
 TURNING = "momentum trunk foot_turning swing_turning arm_posture leg_posture lateral_posture stop"
 UNITS = {f"{name}_rate": "rad/s" for name in ("momentum", "trunk", "foot", "posture")}
@@ -95,7 +95,7 @@ class LandingController:
     ``reference``, spring-dampers lead to the middle of the feet at standing height. ``solver``
     counts the QPs posed and those without a solution. With ``may_step`` it takes a ``step``
     wherever its feet alone cannot catch the robot; what was planned ends there. Forces of the feet
-    err by ``force_noise_n`` [N] each.
+    err by ``force_noise_n`` [N] each. ``gains`` are those of a robot of size one.
     """
 
     def __init__(
@@ -105,10 +105,11 @@ class LandingController:
         reference: LandingPlan | None = None,
         may_step: bool = False,
         force_noise_n: float = 0.0,
+        gains: LandingGains = GAINS,
     ):
         self._may_step = may_step
         self.body = body = WholeBody(robot)
-        self.gains = body.size.scaled(GAINS, UNITS)
+        self.gains = body.size.scaled(gains, UNITS)
         self._horizon_s = body.size.of(STOP_HORIZON_S, "s")
         self._most_turn = body.size.of(MAX_TURN, "rad/s^2")
         self._most_back = body.size.of(MAX_BACK, "rad/s")
@@ -144,8 +145,12 @@ class LandingController:
         self._effort_rows = np.vstack([body.unknowns, left - right])
         weights = (g.acceleration_weight, g.wrench_weight, g.uneven_weight)
         self._effort_weight = np.repeat(weights, [body.nv, 12, 6])
+        self._anchors: list | None = None  # where wrenches act, if not at the soles' middles
         rest = stance_configuration(robot)
+        # posture to go to, and its rates and accelerations
         self._rest = rest[7:]
+        self._rest_rates: np.ndarray | float = 0.0
+        self._rest_push: np.ndarray | float = 0.0
         self._rest_pitch = float(robot.stance["trunk_pitch_rad"])
         gauge = Gauge(robot)
         self._height = float(gauge.com(rest)[2])  # above the soles
@@ -161,7 +166,7 @@ class LandingController:
         ``v`` (nv,) and vertical foot forces (2,) [N].
         """
         body = self.body
-        body.update(q, v)
+        body.update(q, v, self._anchors)
         if self._may_step:
             self.step.look(time, body, foot_force)
         if self.step.starts_s:
@@ -223,11 +228,15 @@ class LandingController:
             if steps:
                 wish[:3] = within(self.step.foot_acceleration(time, body), MAX_STEP)
             target = wish - body.sole_drift[side]
-            weight = self._foot_weights[int(steps or contact[side])]
+            weight = self._foot_weight(side, bool(steps or contact[side]))
             qp.cost(f"foot {side}", body.sole_rows[side], target, weight)
         qp.cost("posture", body.unknowns[6:-12], *self.posture_wish(q, v))
         qp.cost("effort", self._effort_rows, 0.0, self._effort_weight)
         return qp
+
+    def _foot_weight(self, side: int, stands: bool) -> np.ndarray:
+        """Weights (6,) of a foot that ``stands``, or steps, or is in the air."""
+        return self._foot_weights[int(stands)]
 
     def _lower_m(self) -> float:
         """By how much hips are lower over feet that stand further apart than in the stance, on legs
@@ -281,7 +290,7 @@ class LandingController:
         rate = self.gains.posture_rate
         motors = self.body.motors
         back = within(rate / 2 * (self._rest - q[7:]), self._most_back)
-        wish = 2 * rate * (back - v[6:])
+        wish = self._rest_push + 2 * rate * (back + self._rest_rates - v[6:])
         weight = self._posture_weight.copy()
         ahead = q[7:] + v[6:] * self._horizon_s
         for stop, way in ((motors.lower, 1.0), (motors.upper, -1.0)):

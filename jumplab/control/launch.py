@@ -72,6 +72,27 @@ def check_mode(mode: str) -> None:
         )
 
 
+def toes(gauge: Gauge, q: np.ndarray) -> list[np.ndarray]:
+    """Places (3,) of the left and the right toe [m]."""
+    return [foot.act(gauge.robot.foot.tip) for foot in gauge.places(q)]
+
+
+def balance_rows(robot: Robot, tape: Tape, steps: int) -> np.ndarray:
+    """CoM, its velocity and acceleration, L, its rate, and the places of the left and the right toe
+    (steps + 1, 7, 3) of a tape, on the grid of control.
+    """
+    gauge = Gauge(robot)
+    gravity = robot.model.gravity.linear
+    rows = []
+    for q, v, f in zip(tape.q, tape.v, tape.f, strict=True):
+        now = gauge.motion(q, v)
+        push = f[:, :3].sum(axis=0) / robot.total_mass + gravity
+        arms = np.array([foot.translation for foot in gauge.places(q)]) - now.com
+        moment = (f[:, 3:] + np.cross(arms, f[:, :3])).sum(axis=0)
+        rows.append([now.com, now.velocity, push, now.momentum, moment, *toes(gauge, q)])
+    return resampled(np.arange(steps + 1) * STEP_S, tape.t, np.array(rows))
+
+
 class LaunchFeedback:
     """Changes the commands of one launch; see the module's docstring.
 
@@ -104,7 +125,7 @@ class LaunchFeedback:
         self._farthest = 0.0  # [rad]
         self._left = about_vertical(self._gauge.heading(tape.q[0]))[:, 1]
         self._first = tape.q[0]
-        self.rows = self._planned(tape)
+        self.rows = balance_rows(robot, tape, playback.steps)
         flat = robot.foot.center, LENGTH_SHARE
         stands = {tapes.AIR: flat, tapes.TOE: (robot.foot.tip, 0.0), tapes.FLAT: flat}
         self._stands = {
@@ -113,28 +134,8 @@ class LaunchFeedback:
         }
         self._legs = [leg - BASE for leg in leg_columns(robot)]
 
-    def _planned(self, tape: Tape) -> np.ndarray:
-        """CoM, its velocity and acceleration, L, its rate, and the places of the left and the right
-        toe (steps, 7, 3) of the tape.
-        """
-        mass = self._robot.total_mass
-        gravity = self._robot.model.gravity.linear
-        rows = []
-        for q, v, f in zip(tape.q, tape.v, tape.f, strict=True):
-            now = self._gauge.motion(q, v)
-            push = f[:, :3].sum(axis=0) / mass + gravity
-            moment = self._moment(q, now.com, f)
-            rows.append([now.com, now.velocity, push, now.momentum, moment, *self._toes(q)])
-        grid = np.arange(self.playback.steps + 1) * STEP_S
-        return resampled(grid, tape.t, np.array(rows))
-
     def _toes(self, q: np.ndarray) -> list[np.ndarray]:
-        return [foot.act(self._robot.foot.tip) for foot in self._gauge.places(q)]
-
-    def _moment(self, q: np.ndarray, com: np.ndarray, wrench: np.ndarray) -> np.ndarray:
-        """Moment (3,) about ``com`` of wrenches (2, 6) at the origins of the foot links."""
-        arms = np.array([foot.translation for foot in self._gauge.places(q)]) - com
-        return (wrench[:, 3:] + np.cross(arms, wrench[:, :3])).sum(axis=0)
+        return toes(self._gauge, q)
 
     def to_json(self) -> dict:
         """Counts and deviations of the launch, for the settings of a result."""

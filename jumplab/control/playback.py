@@ -126,10 +126,10 @@ class Playback:
                 rows[: len(share)] += share[:, None] * error
 
     def add(self, way: PPoly) -> None:
-        """Add joint angles (nv - 6,) over time [s], with their rates, to the tape's as long as the
+        """Add joint angles (nv - 6,) over time [s], with their rates, to the tape's while the
         ``way`` lasts.
         """
-        rows = self._grid < way.x[-1]
+        rows = (self._grid >= way.x[0]) & (self._grid < way.x[-1])
         self._q[rows] += way(self._grid[rows])
         self._rate[rows] += way(self._grid[rows], 1)
 

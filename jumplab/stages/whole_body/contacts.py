@@ -248,6 +248,18 @@ class Contacts:
         """Number of the last phase in flight; -1 if there is none."""
         return max((k for k, p in enumerate(self.phases) if p.flying), default=-1)
 
+    @property
+    def rebounds(self) -> tuple[int, ...]:
+        """Numbers of the flights after which both feet come down flat, where the robot is to be
+        caught; none unless it goes on to fly again after one of them.
+        """
+        caught = tuple(
+            k
+            for k, (p, after) in enumerate(pairwise(self.phases))
+            if p.flying and after.feet == "LR"
+        )
+        return caught if caught and caught[0] < self.last_flight else ()
+
     def is_aimed(self, contact: int) -> bool:
         """Whether a contact (index into :attr:`landings`) is one that the target places."""
         return self.aimed and self.landings[contact][0] > self.last_flight

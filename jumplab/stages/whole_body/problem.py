@@ -35,6 +35,7 @@ from jumplab.stages.whole_body.terms import (
     motor_lines,
     opening_rows,
     over_block,
+    rebound_rows,
     reserve,
     rise,
     sides_apart,
@@ -100,6 +101,11 @@ class Schedule:
         phases = self.contacts.phases
         before = phases[max(k - 1, 0)].modes
         return [side for side in phases[k].modes if side not in before]
+
+    @cached_property
+    def _rebounds(self) -> tuple[int, ...]:
+        """Of the schedule; a clip has its own ones."""
+        return () if self.follows else self.contacts.rebounds
 
     @cached_property
     def whole(self) -> Schedule:
@@ -196,6 +202,8 @@ class Schedule:
             terms += flight_rows(m)
         if last and self.contacts.ends == "touchdown":
             terms += touchdown_rows(m)
+        if k in self._rebounds:
+            terms += rebound_rows(m)
         if self.contacts.aimed and k == self.contacts.last_flight:
             terms.append(rise())
         met = [x for x in self.apart if x.phase == k]
@@ -292,7 +300,8 @@ class Schedule:
         wide[CHART.index("roll")] = lim.roll_rad
         least = -np.inf if mode.flying else lim.straight_knee_rad
         most = np.inf if free.even else lim.knee_rad
-        low, high = self.body.ranges(lim.range_margin_rad, least, most)
+        margin = max(lim.range_margin_rad, lim.rebound_range_rad if self._rebounds else 0.0)
+        low, high = self.body.ranges(margin, least, most)
         low, high = free.within(np.concatenate([-wide, low]), np.concatenate([wide, high]))
         low = np.concatenate([low, none])
         high = np.concatenate([high, none + lim.heel_up_rad])

@@ -520,16 +520,6 @@ def touchdown_rows(m: Mode) -> list[Term]:
     free = m.free
     body = m.body
     angles = [free.free[k] - 3 for k in free.turns]
-    low = np.array([-lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]])[angles]
-    high = np.array([lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]])[angles]
-
-    def attitude(p):
-        return (p.attitude - ca.vertcat(p.p.yaw, 0, p.p.rotation))[angles]
-
-    def knees(p):
-        bent = body.knees[: len(free.sides)]
-        return ca.vertcat(*(sign * p.tree.q[BASE + k] + angle for k, sign, angle in bent))
-
     # hips that hardly bend let a robot squat less than a landing should have
     bent = min(lim.touchdown_knee[0], body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
     trunk = rates_within(m, lim.touchdown_trunk_rate, np.eye(3)[0][angles])
@@ -538,13 +528,43 @@ def touchdown_rows(m: Mode) -> list[Term]:
     return [
         rise(),
         *touchdown_feet(m),
-        limit("attitude at touchdown", "ours", "rad", "end", attitude, low, high),
-        limit("knees at touchdown", "ours: stroke", "rad", "end", knees, *bent),
+        *landing_posture(m, bent),
         limit("joint rates at touchdown", "WF-E1, relaxed", "rad/s", "end", "rates", -rate, rate),
         limit(*turning, lambda p: p.v[free.turns], *trunk),
         *upright_waist(m),
-        *ankle_stroke(m),
+        *ankle_stroke(m, lim.touchdown_ankle_stroke if free.plane else None),
         *capture_rows(m),
+    ]
+
+
+def rebound_rows(m: Mode) -> list[Term]:
+    """End of a flight after which the robot is caught on both feet, and goes on: posture, stroke of
+    the ankles, and the soles against the CoM. Feet come down as the ground asks, without speed.
+    """
+    lim = m.limits
+    bent = lim.straight_knee_rad, lim.touchdown_knee[1]
+    stroke = ankle_stroke(m, lim.rebound_ankle_rad)
+    return [*landing_posture(m, bent), *stroke, *capture_rows(m)]
+
+
+def landing_posture(m: Mode, bent: tuple[float, float]) -> list[Term]:
+    """Attitude of the base, and flexion of the knees between ``bent`` [rad], at touchdown."""
+    lim = m.limits
+    free = m.free
+    angles = [free.free[k] - 3 for k in free.turns]
+    low = np.array([-lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]])[angles]
+    high = np.array([lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]])[angles]
+
+    def attitude(p):
+        return (p.attitude - ca.vertcat(p.p.yaw, 0, p.p.rotation))[angles]
+
+    def knees(p):
+        legs = m.body.knees[: len(free.sides)]
+        return ca.vertcat(*(sign * p.tree.q[BASE + k] + angle for k, sign, angle in legs))
+
+    return [
+        limit("attitude at touchdown", "ours", "rad", "end", attitude, low, high),
+        limit("knees at touchdown", "ours: stroke", "rad", "end", knees, *bent),
     ]
 
 
@@ -611,14 +631,14 @@ def touchdown_feet(m: Mode) -> list[Term]:
     ]
 
 
-def ankle_stroke(m: Mode) -> list[Term]:
-    """If asked, ankles keep some way to the stop that the shanks lean into."""
-    stroke = m.limits.touchdown_ankle_stroke
-    if stroke is None or not m.free.plane:
+def ankle_stroke(m: Mode, stroke: float | None) -> list[Term]:
+    """Ankles keep a ``stroke`` [rad], if it is given, to the stop that the shanks lean into."""
+    if stroke is None:
         return []
     least = float(m.robot.sagittal.lower[2]) + stroke
-    words = "ankles at touchdown", "ours, for flips: stroke", "rad", "end"
-    return [limit(*words, lambda p: p.joints.ankle[0], least)]
+    sides = slice(len(m.free.sides))
+    words = "ankles at touchdown", "ours: stroke", "rad", "end"
+    return [limit(*words, lambda p: p.joints.ankle[sides], least)]
 
 
 def capture_rows(m: Mode) -> list[Term]:

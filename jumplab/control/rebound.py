@@ -1,0 +1,243 @@
+"""Flights before the last one of a tape: the robot comes down on both feet, and goes on.
+
+A tape that is played through them has errors that grow like a pendulum's, from one contact to the
+next. Here, as after the last flight, a whole-body QP in torque mode takes over as the feet touch
+the ground; but it leads CoM, angular momentum, trunk and posture along the tape, until the feet
+leave again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from scipy.interpolate import CubicHermiteSpline
+
+from jumplab.control import STEP_S
+from jumplab.control.body import PERIOD_STEPS, corner_rows
+from jumplab.control.flight import Flight
+from jumplab.control.kinematics import Gauge, State, rotation
+from jumplab.control.landing import (
+    GAINS,
+    PLANNED_FRICTION,
+    LandingController,
+)
+from jumplab.control.launch import FADE_SHARE, balance_rows, toes
+from jumplab.control.playback import AIR, FLAT, Command, Playback, resampled
+from jumplab.control.reaim import Reaim
+from jumplab.io import tape as tapes
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet
+
+# the next flight hangs on height and angular momentum at its start: with the landing's own numbers
+# half as many perturbed robots stand after five bounds
+TRACKING = replace(GAINS, com_rate_z=10.0, momentum_rate=16.0, momentum_weight=3.0)
+# [s] so long before a touchdown is due, its forecast is made no more: it knows no ground
+NEAR_S = 0.03
+PITCH = 4  # of a foot's twist, free on its toe
+
+
+class Tracker(LandingController):
+    """Torques that lead the robot along the tape while its feet stand; ``q`` and ``v`` are the
+    tape's, on the grid of control.
+    """
+
+    def __init__(self, robot: Robot, tape: Tape, playback: Playback, force_noise_n: float):
+        super().__init__(robot, force_noise_n=force_noise_n, gains=TRACKING)
+        self._gauge = Gauge(robot)
+        self._playback = playback
+        grid = np.arange(playback.steps + 1) * STEP_S
+        self._rows = balance_rows(robot, tape, playback.steps)
+        self.q = resampled(grid, tape.t, tape.q)
+        self.v = resampled(grid, tape.t, tape.v)
+        self._due = 0
+        flat = on_feet(robot, robot.foot.center), self._corners
+        toe = on_feet(robot, robot.foot.tip), corner_rows(robot, PLANNED_FRICTION, 0.0, 1.0)
+        self._stands = {
+            stand: (anchors, np.split(rows, 2))
+            for stand, (anchors, rows) in {tapes.FLAT: flat, tapes.TOE: toe}.items()
+        }
+
+    def begin(self) -> None:
+        """Feet come down once more, perhaps on other ground."""
+        self._last_contact[:] = -np.inf
+        self._ground = np.inf
+        self._leaning[:] = False
+
+    def lead(self, step: int, state: State) -> np.ndarray:
+        """Torques (nv - 6,) [N m] with which the robot, in a measured ``state``, goes on as the
+        tape does from ``step``.
+        """
+        due = min(step + self._playback.lead, len(self._rows) - 2)
+        if self._playback.stands(due) != AIR:  # of a take-off that is due, the last contact
+            self._due = due
+        self._stand = self._playback.stands(self._due)
+        q, v = self.q[self._due], self.v[self._due]
+        self._rest = q[7:]
+        self._rest_rates = v[6:]
+        gained = (self.v[self._due + 1] - v) / STEP_S
+        self._rest_push = gained[6:]
+        self._trunk = rotation(q[3:7]), v[3:6], gained[3:6]
+        parts = [
+            (self._stands[x][0][side], self._stands[x][1][side])
+            for side, x in enumerate(self._stand)
+        ]
+        self._anchors = [anchor for anchor, _ in parts]
+        self._corners = np.vstack([rows for _, rows in parts])
+        com, self._speed, self._push, self._momentum, self._twist, *places = self._rows[self._due]
+        # the plan goes on where the feet are
+        moved = np.subtract(toes(self._gauge, state.q), places).mean(axis=0)
+        self._com = com + moved
+        return self.torque(step * STEP_S, *state[:2], state.wrench[:, 2])
+
+    def standing(self, time: float, foot_force: np.ndarray) -> np.ndarray:
+        """Which feet (2,) may carry weight: those that feel the ground, if any does; on their toes
+        both.
+        """
+        felt = super().standing(time, foot_force)
+        flat = self._stand == FLAT and felt.any()
+        return felt if flat else np.ones(2, bool)
+
+    def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        body = self.body
+        rate = self._com_rate
+        wish = rate**2 * (self._com - body.com) + 2 * rate * (self._speed - body.com_velocity)
+        missing = self._momentum - body.momentum
+        return self._push + wish, self._twist + self.gains.momentum_rate * missing
+
+    def _trunk_wish(self, v: np.ndarray) -> np.ndarray:
+        rate = self.gains.trunk_rate
+        attitude, spin, gained = self._trunk
+        off = self.body.trunk.T @ attitude
+        return off @ gained + rate**2 * pin.log3(off) + 2 * rate * (off @ spin - v[3:6])
+
+    def _foot_weight(self, side: int, stands: bool) -> np.ndarray:
+        weight = super()._foot_weight(side, stands)
+        free = (np.arange(6) == PITCH) & (self._stand[side] == tapes.TOE)
+        return np.where(free, 0.0, weight)
+
+
+@dataclass
+class Passage:
+    """A flight before the last one, between its first and its last step on the tape."""
+
+    begin: int
+    end: int
+    flight: Flight
+    reaim: Reaim | None
+    shift_s: float = 0.0  # by which the tape is read ahead
+
+    def __post_init__(self):
+        self._due_s = self.flight.end_s  # when its touchdown is due, on the tape's clock
+
+    def command(self, step: int, state: State, gauge: Gauge, playback: Playback) -> Command:
+        """Command at a ``step`` of the tape: the rest of it in the time that is left, the legs to
+        where they catch the robot.
+        """
+        t = step * STEP_S
+        now = gauge.motion(*state[:2])
+        left = self.flight.time_left(now)
+        if self._due_s - t > NEAR_S and np.isfinite(left):
+            self._due_s = t + left
+        left = max(self._due_s - t, 0.0)
+        aimed = 0.0
+        if self.reaim is not None:
+            aimed = self.reaim.correction(now, self.flight.turn_ahead(step, now, left), left)
+        before = self.shift_s
+        at = float(self.flight.place(0.0, t, t, left))
+        self.shift_s = min(at, (self.end - 1) * STEP_S) - t
+        pace = (self.shift_s - before) / STEP_S
+        return playback.command(step, *state[:2], aimed, self.shift_s, pace)
+
+    def may_end(self, step: int) -> bool:
+        """Whether feet that feel the ground at a ``step`` have come down; sooner, they graze it."""
+        return step * STEP_S >= self.flight.from_s
+
+
+def passages(
+    robot: Robot, tape: Tape, flights: Sequence[slice], ground: Callable[[float], float], aim: bool
+) -> list[Passage]:
+    """Those of ``flights`` of a tape after which both feet come down flat; legs are put to where
+    they can catch the robot if ``aim``.
+    """
+    found = []
+    for rows in flights:
+        if tuple(tape.contacts[rows.stop].tolist()) == FLAT:
+            part = tape.until(rows.stop)
+            begin, end = (round(float(tape.t[row]) / STEP_S) for row in (rows.start, rows.stop))
+            reaim = Reaim(robot, part) if aim else None
+            found.append(Passage(begin, end, Flight(robot, part, ground), reaim))
+    return found
+
+
+class Rebounds:
+    """Commands from the first of some ``passages`` (at least one) of a tape to the take-off of its
+    last flight.
+
+    Attributes
+    ----------
+    late : steps by which the robot is behind the tape, which is read so much later.
+    begun : whether the first of them is under way, or over.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        tape: Tape,
+        playback: Playback,
+        passages: list[Passage],
+        touches_n: float,
+        force_noise_n: float,
+    ):
+        self.late = 0
+        self.tracker = Tracker(robot, tape, playback, force_noise_n)
+        self._playback = playback
+        self._gauge = Gauge(robot)
+        self._passages = list(passages)
+        self._first = passages[0].begin
+        times = np.append(tape.t, tape.t[-1])
+        self._ends = [round(float(times[rows.stop]) / STEP_S) for rows in tape.flights]
+        self._touches_n = touches_n
+        self._since: int | None = None  # the step in which the feet came down
+        self._tau = np.zeros(len(robot.joint_names))
+        self.begun = False
+
+    def command(self, step: int, state: State) -> Command | None:
+        """Command at a ``step``, from the measured ``state``; None where the tape is played as it
+        is.
+        """
+        at = step - self.late
+        self.begun |= at >= self._first
+        if self._since is not None:
+            if self._playback.stands(at) != AIR:
+                return self._lead(step, state)
+            self._leave(at, state)
+        if not self._passages or at < self._passages[0].begin:
+            return None
+        passage = self._passages[0]
+        command = passage.command(at, state, self._gauge, self._playback)
+        if not (passage.may_end(at) and state.wrench[:, 2].sum() > self._touches_n):
+            return command
+        self._passages.pop(0)
+        self.late += at - passage.end
+        self._since = step
+        self.tracker.begin()
+        return self._lead(step, state)
+
+    def _lead(self, step: int, state: State) -> Command:
+        if (step - self._since) % PERIOD_STEPS == 0:
+            self._tau = self.tracker.lead(step - self.late, state)
+        return Command(tau=self._tau)
+
+    def _leave(self, step: int, state: State) -> None:
+        """The feet leave: what joints are off the tape fades in the air."""
+        self._since = None
+        lasts = FADE_SHARE * (next(end for end in self._ends if end > step) - step)
+        off = state.q[7:] - self.tracker.q[step, 7:]
+        rates = state.v[6:] - self.tracker.v[step, 6:]
+        t = np.array([step, step + lasts]) * STEP_S
+        still = np.zeros_like(off)
+        self._playback.add(CubicHermiteSpline(t, np.array([off, still]), np.array([rates, still])))
