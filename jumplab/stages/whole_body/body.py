@@ -84,6 +84,12 @@ class Body:
             high[k] = min(high[k], bent[1])
         return low, high
 
+    @property
+    def stops_off_rad(self) -> np.ndarray:
+        """Way (joints,) of the stance to the nearer stop of each joint."""
+        stance = self.stance[BASE:]
+        return np.minimum(stance - self.motors.lower, self.motors.upper - stance)
+
     @cached_property
     def squat_rad(self) -> float:
         """Flexion of the knees to which the hips' stops let the robot squat: hips turn by half of

@@ -300,7 +300,11 @@ class Schedule:
         wide[CHART.index("roll")] = lim.roll_rad
         least = -np.inf if mode.flying else lim.straight_knee_rad
         most = np.inf if free.even else lim.knee_rad
-        margin = max(lim.range_margin_rad, lim.rebound_range_rad if self._rebounds else 0.0)
+        margin = lim.range_margin_rad
+        if self._rebounds:
+            margin = np.maximum(
+                margin, np.minimum(lim.rebound_range_rad, self.body.stops_off_rad / 2)
+            )
         low, high = self.body.ranges(margin, least, most)
         low, high = free.within(np.concatenate([-wide, low]), np.concatenate([wide, high]))
         low = np.concatenate([low, none])
