@@ -32,9 +32,9 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet
 
-# the next flight hangs on height, place and angular momentum at its start. Of two bounds of eight
-# perturbed robots the second begins with 1 cm/s of speed aside and 0.3 kg m^2/s of roll too much
-# (rms); with the landing's own rates and weight ahead and aside it is 10 cm/s and 0.8
+# the next flight hangs on height, place and angular momentum at its start. Two bounds of four
+# perturbed robots in each engine: the second begins with 1 cm/s of speed aside and 0.3 kg m^2/s of
+# roll too much (rms); with the landing's own rates and weights ahead and aside 10 cm/s and 0.8
 TRACKING = replace(
     GAINS,
     com_rate_xy=6.0,
