@@ -110,6 +110,7 @@ class Tracker(LandingController):
         return felt if flat else np.ones(2, bool)
 
     def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Wished CoM acceleration (3,) and rate of angular momentum (3,), those of the tape."""
         body = self.body
         rate = self._com_rate
         wish = rate**2 * (self._com - body.com) + 2 * rate * (self._speed - body.com_velocity)
@@ -117,12 +118,14 @@ class Tracker(LandingController):
         return self._push + wish, self._twist + self.gains.momentum_rate * missing
 
     def _trunk_wish(self, v: np.ndarray) -> np.ndarray:
+        """Angular acceleration (3,) of the trunk in its own axes, towards the tape's attitude."""
         rate = self.gains.trunk_rate
         attitude, spin, gained = self._trunk
         off = self.body.trunk.T @ attitude
         return off @ gained + rate**2 * pin.log3(off) + 2 * rate * (off @ spin - v[3:6])
 
     def _foot_weight(self, side: int, stands: bool) -> np.ndarray:
+        """Weights (6,) of a foot; on its toe it may pitch."""
         weight = super()._foot_weight(side, stands)
         free = (np.arange(6) == PITCH) & (self._stand[side] == tapes.TOE)
         return np.where(free, 0.0, weight)
@@ -142,8 +145,8 @@ class Passage:
         self._due_s = self.flight.end_s  # when its touchdown is due, on the tape's clock
 
     def command(self, step: int, state: State, gauge: Gauge, playback: Playback) -> Command:
-        """Command at a ``step`` of the tape: the rest of it in the time that is left, the legs to
-        where they catch the robot.
+        """Command at a ``step`` of the tape: the rest of it in the time that is left [s], the legs
+        to where they catch the robot.
         """
         t = step * STEP_S
         now = gauge.motion(*state[:2])
@@ -161,15 +164,17 @@ class Passage:
         return playback.command(step, *state[:2], aimed, self.shift_s, pace)
 
     def may_end(self, step: int) -> bool:
-        """Whether feet that feel the ground at a ``step`` have come down; sooner, they graze it."""
+        """Whether feet that feel the ground at a ``step`` have come down; sooner, they
+        graze it.
+        """
         return step * STEP_S >= self.flight.from_s
 
 
 def passages(
     robot: Robot, tape: Tape, flights: Sequence[slice], ground: Callable[[float], float], aim: bool
 ) -> list[Passage]:
-    """Those of ``flights`` of a tape after which both feet come down flat; legs are put to where
-    they can catch the robot if ``aim``.
+    """Those of ``flights`` of a tape after which both feet come down flat, over a ``ground`` whose
+    height [m] is known at a place [m]; legs are put to where they can catch the robot if ``aim``.
     """
     found = []
     for rows in flights:
@@ -236,12 +241,13 @@ class Rebounds:
         return self._lead(step, state)
 
     def _lead(self, step: int, state: State) -> Command:
+        """Torques (nv - 6,) [N m] of the tracker, held for some steps."""
         if (step - self._since) % PERIOD_STEPS == 0:
             self._tau = self.tracker.lead(step - self.late, state)
         return Command(tau=self._tau)
 
     def _leave(self, step: int, state: State) -> None:
-        """The feet leave: what joints are off the tape fades in the air."""
+        """The feet leave: angles (nv - 6,) by which joints are off the tape [rad] fade in the air."""
         self._since = None
         lasts = FADE_SHARE * (next(end for end in self._ends if end > step) - step)
         off = state.q[7:] - self.tracker.q[step, 7:]
