@@ -247,7 +247,7 @@ class Rebounds:
         return Command(tau=self._tau)
 
     def _leave(self, step: int, state: State) -> None:
-        """The feet leave: angles (nv - 6,) by which joints are off the tape [rad] fade in the air."""
+        """The feet leave: angles (nv - 6,) of joints off the tape [rad] fade in the air."""
         self._since = None
         lasts = FADE_SHARE * (next(end for end in self._ends if end > step) - step)
         off = state.q[7:] - self.tracker.q[step, 7:]
