@@ -148,12 +148,7 @@ class Controller:
         self.forecast = Flight(robot, tape, ground) if flies else None
         self.landing = LandingController(robot, may_step=step, force_noise_n=hardware.force_noise_n)
         flip = is_flip(tape)
-        hindrance = None
-        if not flies:
-            hindrance = "a robot that stands on one foot does not fall onto the other"
-        elif (turned := _turned_rad(tape, self._gauge)) >= TURNS_RAD:
-            hindrance = f"stage 1 knows no landing after a turn by {np.degrees(turned):.0f} degrees"
-        self.ahead = LandingAhead(robot, landing, hindrance)
+        self.ahead = LandingAhead(robot, landing, _hindrance(tape, self._gauge, flies))
         self._reaim = Reaim(robot, tape, legs_alone=flip) if reaim and flies else None
         self._shifts = reaim and flip
         self._often = OFTENER if flip else 1
@@ -306,6 +301,16 @@ class Controller:
         if self.ahead.followed is None:  # ground came early
             self.landing.reference = self.ahead.plan(*state[:2], step * STEP_S, 0.0)
         return state
+
+
+def _hindrance(tape: Tape, gauge: Gauge, flies: bool) -> str | None:
+    """Why stage 1's landing cannot be followed; None if it can."""
+    if not flies:
+        return "a robot that stands on one foot does not fall onto the other"
+    turned = _turned_rad(tape, gauge)
+    if turned < TURNS_RAD:
+        return None
+    return f"stage 1 knows no landing after a turn by {np.degrees(turned):.0f} degrees"
 
 
 def _turned_rad(tape: Tape, gauge: Gauge) -> float:

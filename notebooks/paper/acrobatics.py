@@ -161,7 +161,7 @@ def lands(row: dict[str, Any]) -> bool:
 
 
 def landings(row: dict[str, Any]) -> str:
-    """How many robots that differ land, engine by engine; empty where none was asked."""
+    """Counts of robots that differ and land, engine by engine; empty where none was asked."""
     return ", ".join(f"{sum(x)} of {len(x)}" for x in row.get("perturbed", {}).values())
 
 
