@@ -304,7 +304,7 @@ class Controller:
 
 
 def _hindrance(tape: Tape, gauge: Gauge, flies: bool) -> str | None:
-    """Why stage 1's landing cannot be followed; None if it can."""
+    """Reason for which stage 1's landing cannot be followed; None if it can be."""
     if not flies:
         return "a robot that stands on one foot does not fall onto the other"
     turned = _turned_rad(tape, gauge)
