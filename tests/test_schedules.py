@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
+from paper.basin import WrongApex
 from scipy.interpolate import CubicHermiteSpline
 
 import jumplab as jl
@@ -249,6 +250,15 @@ def test_between_two_flights_a_robot_unlike_its_model_is_led_back_to_the_plan(bh
     along, aside, up, roll, pitch, yaw = np.sqrt(np.mean(np.square(off), axis=0))
     assert max(along, aside) < 0.025 and up < 0.07
     assert roll < 0.3 and pitch < 0.55 and yaw < 0.2
+
+
+def test_a_run_may_begin_in_the_last_of_its_flights(bhr):
+    tape = two_bounds().tape
+    second = tape.flights[1]
+    run = simulate_jump(tape, bhr, disturbance=WrongApex(pitch_rad=0.1), reaim=True)
+    assert run.landed and run.checks_passed, run.line()
+    # what is left of the last flight, and nothing of the launch before it
+    assert run.metrics.touchdown_s == pytest.approx((tape.t[second.stop] - tape.t[second.start]) / 2, abs=0.05)
 
 
 def test_what_is_added_to_a_tape_changes_nothing_before_it(bhr):

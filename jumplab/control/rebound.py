@@ -223,6 +223,8 @@ class Rebounds:
         is.
         """
         at = step - self.late
+        if not self.begun:  # a run may begin later on the tape
+            self._passages = [x for x in self._passages if x.end > at]
         self.begun |= at >= self._first
         if self._since is not None:
             if self._playback.stands(at) != AIR:
