@@ -252,6 +252,13 @@ def test_between_two_flights_a_robot_unlike_its_model_is_led_back_to_the_plan(bh
     assert roll < 0.3 and pitch < 0.55 and yaw < 0.2
 
 
+def test_a_bound_before_a_hop_from_one_foot_is_played(bhr):
+    ahead = [0.25, 0.25, 0.35, 0.35]
+    plan = jl.plan(robot=bhr, contacts=jl.Contacts.of("LR lr - LR L l - LR", bhr, [jl.Place(x) for x in ahead]))
+    run = jl.simulate(plan)
+    assert run.landed and run.checks_passed, run.line()
+
+
 def test_a_run_may_begin_in_the_last_of_its_flights(bhr):
     tape = two_bounds().tape
     second = tape.flights[1]

@@ -239,13 +239,11 @@ class Controller:
 
     def _play(self, step: int, state: State) -> Command:
         """Before the last flight is under way."""
-        if self.rebounds is not None:
-            command = self.rebounds.command(step, state)
-            if command is not None:
-                return command
+        command = None if self.rebounds is None else self.rebounds.command(step, state)
         at = step - self._late
-        command = self.playback.command(at, *state[:2])
-        if self.feedback is None or (self.rebounds and self.rebounds.begun):
+        if command is None:
+            command = self.playback.command(at, *state[:2])
+        if self.feedback is None or command.q is None:
             return command
         return self.feedback(at, command, state)
 

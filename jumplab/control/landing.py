@@ -80,7 +80,7 @@ class LandingGains:
     acceleration_weight: float = 1e-4
 
 
-GAINS = LandingGains()
+GAINS = LandingGains()  # of a robot of size one
 # their units, where a robot's size matters: natural frequencies, weights of angular accelerations
 TURNING = "momentum trunk foot_turning swing_turning arm_posture leg_posture lateral_posture stop"
 UNITS = {f"{name}_rate": "rad/s" for name in ("momentum", "trunk", "foot", "posture")}

@@ -164,7 +164,7 @@ class LaunchFeedback:
         axes.
         """
         due = step + self.playback.lead
-        stand = self.playback.stands(due)
+        stand = command.feet
         if stand == AIR or due >= len(self.rows):
             self.changes = self._back(self._fade_rate)
             self._torque = 0.0

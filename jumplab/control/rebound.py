@@ -19,11 +19,7 @@ from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS, corner_rows
 from jumplab.control.flight import Flight
 from jumplab.control.kinematics import Gauge, State, rotation
-from jumplab.control.landing import (
-    GAINS,
-    PLANNED_FRICTION,
-    LandingController,
-)
+from jumplab.control.landing import GAINS, PLANNED_FRICTION, LandingController
 from jumplab.control.launch import FADE_SHARE, balance_rows, toes
 from jumplab.control.playback import AIR, FLAT, Command, Playback, resampled
 from jumplab.control.reaim import Reaim
@@ -31,6 +27,7 @@ from jumplab.io import tape as tapes
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet
+from jumplab.robot.legs import size
 
 # the next flight hangs on height, place and angular momentum at its start. Two bounds of four
 # perturbed robots in each engine: the second begins with 1 cm/s of speed aside and 0.3 kg m^2/s of
@@ -45,6 +42,8 @@ TRACKING = replace(
 )
 # [s] so long before a touchdown is due, its forecast is made no more: it knows no ground
 NEAR_S = 0.03
+# of soles to the axes of the last landing, in which the CoP's and the legs' rows are written
+ALONG_RAD = 0.3
 PITCH = 4  # of a foot's twist, free on its toe
 
 
@@ -139,10 +138,11 @@ class Passage:
     end: int
     flight: Flight
     reaim: Reaim | None
-    shift_s: float = 0.0  # by which the tape is read ahead
+    near_s: float  # so long before a touchdown is due, its forecast is made no more
 
     def __post_init__(self):
         self._due_s = self.flight.end_s  # when its touchdown is due, on the tape's clock
+        self._shift_s = 0.0  # by which the tape is read ahead
 
     def command(self, step: int, state: State, gauge: Gauge, playback: Playback) -> Command:
         """Command at a ``step`` of the tape: the rest of it in the time that is left [s], the legs
@@ -151,38 +151,44 @@ class Passage:
         t = step * STEP_S
         now = gauge.motion(*state[:2])
         left = self.flight.time_left(now)
-        if self._due_s - t > NEAR_S and np.isfinite(left):
+        if self._due_s - t > self.near_s and np.isfinite(left):
             self._due_s = t + left
         left = max(self._due_s - t, 0.0)
         aimed = 0.0
         if self.reaim is not None:
             aimed = self.reaim.correction(now, self.flight.turn_ahead(step, now, left), left)
-        before = self.shift_s
+        before = self._shift_s
         at = float(self.flight.place(0.0, t, t, left))
-        self.shift_s = min(at, (self.end - 1) * STEP_S) - t
-        pace = (self.shift_s - before) / STEP_S
-        return playback.command(step, *state[:2], aimed, self.shift_s, pace)
+        self._shift_s = min(at, (self.end - 1) * STEP_S) - t
+        pace = (self._shift_s - before) / STEP_S
+        command = playback.command(step, *state[:2], aimed, self._shift_s, pace)
+        return replace(command, feet=AIR)  # also of a robot that comes down later than planned
 
     def may_end(self, step: int) -> bool:
-        """Whether feet that feel the ground at a ``step`` have come down; sooner, they
-        graze it.
-        """
+        """Whether feet that feel the ground at a ``step`` have come down; sooner, they graze it."""
         return step * STEP_S >= self.flight.from_s
 
 
 def passages(
     robot: Robot, tape: Tape, flights: Sequence[slice], ground: Callable[[float], float], aim: bool
 ) -> list[Passage]:
-    """Those of ``flights`` of a tape after which both feet come down flat, over a ``ground`` whose
-    height [m] is known at a place [m]; legs are put to where they can catch the robot if ``aim``.
+    """Those of ``flights`` of a tape after which both feet come down flat, along the heading of the
+    last landing, and carry until they leave together, over a ``ground`` whose height [m] is known
+    at a place [m]; legs are put to where they can catch the robot if ``aim``.
     """
+    near_s = size(robot).of(NEAR_S, "s")
+    gauge = Gauge(robot)
+    starts = np.array([rows.start for rows in tape.flights] + [len(tape.t)])
     found = []
     for rows in flights:
-        if tuple(tape.contacts[rows.stop].tolist()) == FLAT:
+        leaves = starts[starts >= rows.stop][0]
+        both = (tape.contacts[rows.stop : leaves] > tapes.AIR).all()
+        flat = tuple(tape.contacts[rows.stop].tolist()) == FLAT
+        if both and flat and abs(gauge.heading(tape.q[rows.stop])) < ALONG_RAD:
             part = tape.until(rows.stop)
             begin, end = (round(float(tape.t[row]) / STEP_S) for row in (rows.start, rows.stop))
             reaim = Reaim(robot, part) if aim else None
-            found.append(Passage(begin, end, Flight(robot, part, ground), reaim))
+            found.append(Passage(begin, end, Flight(robot, part, ground), reaim, near_s))
     return found
 
 
@@ -193,7 +199,6 @@ class Rebounds:
     Attributes
     ----------
     late : steps by which the robot is behind the tape, which is read so much later.
-    begun : whether the first of them is under way, or over.
     """
 
     def __init__(
@@ -216,16 +221,16 @@ class Rebounds:
         self._touches_n = touches_n
         self._since: int | None = None  # the step in which the feet came down
         self._tau = np.zeros(len(robot.joint_names))
-        self.begun = False
+        self._begun = False
 
     def command(self, step: int, state: State) -> Command | None:
         """Command at a ``step``, from the measured ``state``; None where the tape is played as it
         is.
         """
         at = step - self.late
-        if not self.begun:  # a run may begin later on the tape
+        if not self._begun:  # a run may begin later on the tape
             self._passages = [x for x in self._passages if x.end > at]
-        self.begun |= at >= self._first
+        self._begun |= at >= self._first
         if self._since is not None:
             if self._playback.stands(at) != AIR:
                 return self._lead(step, state)

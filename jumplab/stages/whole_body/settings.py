@@ -61,11 +61,10 @@ class Limits:
     touchdown_waist_rad: float = 0.15  # of each joint of a waist, off the stance either way
     # [rad] if set, least way left to the stop that the shank leans into
     touchdown_ankle_stroke: float | None = None
-    # where the robot goes on after a flight: way to the joint stops, all along the schedule (of a
-    # joint whose stance is nearer than twice that, half of its way there), and of the ankles at
-    # that touchdown to the stop that the shanks lean into; robots that differ from their model
-    # reach them sooner, and cannot be led there
+    # to the joint stops all along a schedule that goes on after a flight, where robots unlike their
+    # model need it; of a joint whose stance is nearer than twice that, half of its way there
     rebound_range_rad: float = 0.08
+    # at the touchdowns of such a schedule, of the ankles to the stop that the shanks lean into
     rebound_ankle_rad: float = 0.25
     # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
     capture_offset_m: float = 0.02
