@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
+from jumplab.control.kinematics import rotation
 from jumplab.ocp.qp import Qp, QpSolver
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet, point_motion, wrench_rows
@@ -128,6 +129,17 @@ class WholeBody:
         qp.cost("CoM", self.force_rows, com - self.gravity, weights[0])
         rows = self.momentum_rows / self._inertia
         qp.cost("momentum", rows, momentum / self._inertia, weights[1])
+
+    def trunk_wish(
+        self, v: np.ndarray, q: np.ndarray, speed: np.ndarray, gained: np.ndarray, rate: float
+    ) -> np.ndarray:
+        """Angular acceleration (3,) of the trunk in its own axes at a velocity ``v`` (nv,), towards
+        a planned ``q`` (nq,), ``speed`` (nv,) and its rate ``gained`` (nv,), by a critically damped
+        ``rate`` [rad/s].
+        """
+        off = self.trunk.T @ rotation(q[3:7])
+        missing = off @ speed[3:6] - v[3:6]
+        return off @ gained[3:6] + rate**2 * pin.log3(off) + 2 * rate * missing
 
     def torque(self, x: np.ndarray) -> np.ndarray:
         """Joint torques (nv - 6,) that go with the unknowns ``x`` (nx,) [N m]."""

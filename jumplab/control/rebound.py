@@ -12,13 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pinocchio as pin
 from scipy.interpolate import CubicHermiteSpline
 
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS, corner_rows
 from jumplab.control.flight import Flight
-from jumplab.control.kinematics import Gauge, State, rotation
+from jumplab.control.kinematics import Gauge, State
 from jumplab.control.landing import GAINS, PLANNED_FRICTION, LandingController
 from jumplab.control.launch import FADE_SHARE, balance_rows, toes
 from jumplab.control.playback import AIR, FLAT, Command, Playback, resampled
@@ -87,7 +86,7 @@ class Tracker(LandingController):
         self._rest_rates = v[6:]
         gained = (self.v[self._due + 1] - v) / STEP_S
         self._rest_push = gained[6:]
-        self._trunk = rotation(q[3:7]), v[3:6], gained[3:6]
+        self._planned = q, v, gained
         parts = [
             (self._stands[x][0][side], self._stands[x][1][side])
             for side, x in enumerate(self._stand)
@@ -118,10 +117,7 @@ class Tracker(LandingController):
 
     def _trunk_wish(self, v: np.ndarray) -> np.ndarray:
         """Angular acceleration (3,) of the trunk in its own axes, towards the tape's attitude."""
-        rate = self.gains.trunk_rate
-        attitude, spin, gained = self._trunk
-        off = self.body.trunk.T @ attitude
-        return off @ gained + rate**2 * pin.log3(off) + 2 * rate * (off @ spin - v[3:6])
+        return self.body.trunk_wish(v, *self._planned, self.gains.trunk_rate)
 
     def _foot_weight(self, side: int, stands: bool) -> np.ndarray:
         """Weights (6,) of a foot; on its toe it may pitch."""

@@ -195,6 +195,11 @@ def _ground(
         legs = Legs.of(schedule.body, list(holds))
         wrench, contacts = _planned(b, phase, holds, at)
         leaves = k + 1 < len(solved) and schedule.modes[k + 1].flying
+        if k == numbers[-1] and k + 1 < len(solved) and not leaves:
+            end = legs.held(motion[:, -1:], holds, b.raised)
+            more = _arriving_legs(schedule, solved, k + 1, end)
+            size = end.shape[-1]
+            motion[..., :size] += quintic(more, phase.duration, at[:, None])
         line = _on_a_line(holds, b.raised) and not (schedule.follows and len(holds) == 1)
         if len(instants) > 1 and (line or leaves or schedule.follows):
             count = 1 if line else max(1, round((instants[-1] - instants[0]) / BALANCED_S))
@@ -206,6 +211,22 @@ def _ground(
     motions, wrenches, codes = zip(*parts, strict=True)
     motion = np.concatenate(motions, axis=1)
     return Piece(t, motion, np.concatenate(wrenches), np.concatenate(codes))
+
+
+def _arriving_legs(
+    schedule: Schedule, solved: Sequence[PhaseSolution], k: int, end: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Ends of a bend, as of :func:`.quintic`, that leads legs from an ``end`` (3, 1, 6 + joints) on
+    the ground to where feet come down as the phase ``k`` begins.
+    """
+    mode = schedule.modes[k]
+    holds = holds_of(solved[k], mode)
+    there = solved[k].sample(0.0)
+    there[..., : end.shape[-1]] = end
+    goal = Legs.of(schedule.body, list(holds)).held(there, holds, mode.raised)
+    off = (goal - end)[:, 0]
+    off[2] = 0.0  # accelerations may jump where a foot lands
+    return [(0 * x, x) for x in off]
 
 
 def _planned(
