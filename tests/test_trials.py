@@ -174,7 +174,7 @@ def test_report_counts(folder, coins):
     assert said["settings"]["noise"] == vars(SensorNoise.typical())  # sensors err unless told otherwise
     assert said["conditions"] == {
         "playback": "position mode (target angles and rates; a drive measures its own joint) in PyBullet, hard contact",
-        "launch": "open loop on two feet; on one, CoM and angular momentum are led back to the plan",
+        "launch": "open loop on two feet; on one, CoM, L, trunk and the other foot are led back to the plan",
         "re-aim": "the legs turn in the air against errors of trunk, speed and momentum, about all axes",
         "recovery step": "none",
         "drawn uniformly, each link and joint by itself": str(Ranges()),

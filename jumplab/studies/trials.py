@@ -52,7 +52,7 @@ NAME = "trials.jsonl"
 CONFIDENCE = 0.95
 # what is corrected: without, with
 LAUNCH = (
-    "open loop on two feet; on one, CoM and angular momentum are led back to the plan",
+    "open loop on two feet; on one, CoM, L, trunk and the other foot are led back to the plan",
     "CoM and angular momentum are led back to the plan",
 )
 REAIM = "no", "the legs turn in the air against errors of trunk, speed and momentum, about all axes"
