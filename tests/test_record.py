@@ -111,8 +111,9 @@ def test_where_an_easy_jump_is_not_easy_half_of_it_is_the_start(bhr, monkeypatch
     assert np.isnan(first) and half > 0.9 and found.audit.passed
 
 
-def test_where_no_finer_mesh_has_a_plan_shares_are_planned_afresh_and_less_high(bhr, monkeypatch):
-    """Of what is sought, and of the rise above the usual 0.2 m, each share is the same."""
+@pytest.fixture
+def shares(bhr, monkeypatch):
+    """A record of bhr that no finer mesh has a plan for, and the shares of it that are planned: (target, near)."""
     stage, asked = type(jl.Planner(bhr).stage("direct")), []
     refined, plan = stage.refined, stage.plan
 
@@ -123,16 +124,28 @@ def test_where_no_finer_mesh_has_a_plan_shares_are_planned_afresh_and_less_high(
 
     def noted(self, task, *given, **options):
         if "near" in options:
-            asked.append((task.platform_m, task.height_m - 0.2, options["near"]))
+            asked.append((task, options["near"]))
         return plan(self, task, *given, **options)
 
     monkeypatch.setattr(stage, "refined", without_the_record)
     monkeypatch.setattr(stage, "plan", noted)
-    found = jl.record(bhr, "platform_m", engines=())
-    platforms, rises, near = zip(*asked, strict=True)
+    return lambda what: (jl.record(bhr, what, engines=()), asked)
+
+
+def test_where_no_finer_mesh_has_a_plan_shares_are_planned_afresh_and_less_high(shares):
+    """Of what is sought, and of the rise above the usual 0.2 m, each share is the same."""
+    found, asked = shares("platform_m")
+    platforms, rises = np.transpose([(task.platform_m, task.height_m - 0.2) for task, _ in asked])
     assert found.audit.passed and found.value == max(x for x in platforms if x <= found.value) < found.best
-    assert len(asked) == study.HALVINGS and platforms[0] == pytest.approx(found.best / 2) and near[0] is None
-    assert np.divide(rises, platforms) == pytest.approx(rises[0] / platforms[0]) and rises[0] > 0
+    assert len(asked) == study.HALVINGS and platforms[0] == pytest.approx(found.best / 2) and asked[0][1] is None
+    assert rises / platforms == pytest.approx(rises[0] / platforms[0]) and rises[0] > 0
+
+
+def test_a_share_of_a_rise_is_that_share_of_it(shares):
+    found, asked = shares("height_m")
+    halves = [task.height_m / found.best for task, _ in asked]
+    assert found.audit.passed and found.value > 0.9 * found.best
+    assert halves[0] == pytest.approx(0.5) and np.mod(32 * np.array(halves), 1) == pytest.approx(0, abs=1e-6)
 
 
 def test_a_record_that_only_a_number_of_the_problem_ends_is_refused_in_a_sentence(bhr):

@@ -433,13 +433,15 @@ class _Search:
         return replace(task, **{self.what: share * getattr(task, self.what)})
 
     def below(self, share: float) -> JumpTask:
-        """A ``share`` [1] of the record. A rise that was sought too goes to the usual one as the
-        share goes to zero: at the record's rise, smaller shares may have no plan either.
+        """A ``share`` [1] of the record. A rise that was sought besides goes to the usual one, if
+        that is lower, as the share goes to zero: at the record's rise, smaller shares may have no
+        plan either.
         """
         task = self.at(self.task, share)
-        if "takeoff_speed" not in self.sought:
+        if self.what == "height_m" or "takeoff_speed" not in self.sought:
             return task
-        return replace(task, height_m=share * task.height_m + (1 - share) * self.given.height_m)
+        usual_m = min(self.given.height_m, task.height_m)
+        return replace(task, height_m=share * task.height_m + (1 - share) * usual_m)
 
     def played(
         self, plan: JumpPlan, share: float, engines: Sequence[str]
