@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,6 +52,7 @@ HALVES = 0.5, 0.25  # of the easiest, where none of them has a plan
 GROWS = 1.5  # times the number before, from one plan to the next
 # shares of the best that they led to, whose own plans, of least effort, are the next starts
 CLIMB = 0.6, 0.75, 0.9
+ROUNDS = 2  # of them at most
 SAME = 0.01  # share of a record within which another start ended in it
 # at the nodes, of the best; halvings of the share between the largest plan and what has none
 HALVINGS = 5
@@ -278,8 +280,8 @@ class _Search:
 
     def starts(self, best: list[tuple]) -> Iterator[JumpTask]:
         """Jumps to begin with: easy ones (:data:`EASY`), if none of them led anywhere half and a
-        quarter of the easiest, then shares of the ``best`` one; after steps, where each takes a
-        minute or more, the middle one of the easy ones alone.
+        quarter of the easiest, then shares of the ``best`` one, once more if they lead to a better
+        one; after steps, where each takes a minute or more, the middle one of the easy ones alone.
         """
         leg = self.stage.body.leg_m
         alone = not self.given.standing
@@ -293,8 +295,12 @@ class _Search:
             if "takeoff_speed" in self.sought:
                 sizes["height_m"] = max(rise * leg, RANGES["height_m"][1])
             yield replace(self.given, **sizes)
-        for share in CLIMB if best and not alone else ():
-            yield self.at(max(best, key=lambda x: x[0])[1], share)
+        for _ in range(ROUNDS if best and not alone else 0):
+            most, _, _ = max(best, key=itemgetter(0))
+            for share in CLIMB:
+                yield self.at(max(best, key=itemgetter(0))[1], share)
+            if max(best, key=itemgetter(0))[0] <= (1 + SAME) * most:
+                break
 
     def from_easy(self) -> tuple[dict[str, float], Solved | None]:
         """Results of all starts, and the best one; None if none of them led anywhere."""
@@ -323,7 +329,7 @@ class _Search:
             best.append((results[word], reached, solved))
         if not best:
             return results, None
-        _, self.task, solved = max(best, key=lambda x: x[0])
+        _, self.task, solved = max(best, key=itemgetter(0))
         return results, solved
 
     def refusal(self, results: Mapping[str, float]) -> InfeasibleError:
