@@ -92,8 +92,9 @@ def test_a_hurdle_clears_its_block():
 
 def test_legs_come_down_beside_one_that_stands_without_a_jump_on_the_tape():
     report = hurdle().audit
-    assert report["position at the switch"].value < 0.01  # [mm, mrad]; 0.1 is allowed
-    assert report["rate at the switch"].value < 1e-3
+    # [mm, mrad], [m/s, rad/s]; 0.1 and 0.01 are allowed, and legs that are only as planned miss by 0.0026 and 8e-6
+    assert report["position at the switch"].value < 8e-4
+    assert report["rate at the switch"].value < 3e-6
 
 
 def test_before_it_leaps_a_robot_unlike_its_model_steps_where_it_shall(bhr):
