@@ -183,6 +183,7 @@ class BulletEngine(Engine):
         lever, tilt = self._bullet.getDynamicsInfo(self._body, -1)[3:5]
         self._lever = np.array(lever)
         self._arm = pin.skew(self._lever)
+        self.keeps_m = lever
         if abs(abs(tilt[3]) - 1) > 1e-9:
             raise RobotError(
                 f"robot {self.robot.name}: the inertial frame of {base} is turned; "

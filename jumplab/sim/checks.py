@@ -202,22 +202,24 @@ def _steps(result: SimulationResult) -> tuple[np.ndarray, np.ndarray, np.ndarray
     the mechanics.
 
     One semi-implicit step does so at its beginning, many do on the whole in the middle.
-    Accelerations are those of the base in world axes, of its CoM or of its origin, as the engine
-    integrates: differences of the twist in the base's own axes, which turn within the step, would
-    be wrong in a flip, those of the other point in a fall.
+    Accelerations are those of the base in world axes, of that point of its link whose velocity the
+    engine integrates (Bullet: the CoM of the link alone, without what is fixed to it; MuJoCo: its
+    origin): differences of the twist in the base's own axes, which turn within the step, or of
+    another point would be wrong in a flip.
     """
     engine = result.settings["engine"]
     share = 0.0 if engine["substeps"] == 1 else 0.5
     model = result.robot.model
-    # to the point of the base whose velocity the engine keeps, base axes
-    arm = model.inertias[1].lever * engine.get("keeps_com", True)
+    # logs of older versions: the CoM of all that is fixed to the base
+    older = model.inertias[1].lever * engine.get("keeps_com", True)
+    arm = np.array(engine.get("keeps_m", older))
     q = result.q[:-1]
     if share:
         pairs = zip(q, result.q[1:], strict=True)
         q = np.array([pin.interpolate(model, *pair, share) for pair in pairs])
     turns, turn = (rotations(x[:, 3:7]) for x in (result.q, q))
     spins = result.v[:, 3:6]
-    # of the base's CoM, in world axes; then within the step, in base axes
+    # of that point, in world axes; then within the step, in base axes
     twists = np.stack([spins, result.v[:, :3] + np.cross(spins, arm)])
     twists = np.einsum("kij,skj->ski", turns, twists)
     change = np.diff(twists, axis=1)

@@ -7,7 +7,7 @@ and passes ``test_sim_world.py``; all else knows no engine.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -84,7 +84,8 @@ class Engine(ABC):
     title: str  # as in sentences
     known: Mapping[str, Any]  # contacts by name, those of :data:`jumplab.sim.CONTACTS`
     contact: Any  # the one of them that this engine has
-    keeps_com: bool = True  # whether its base has the velocity of the CoM, or of the link's origin
+    # point of the base link whose velocity is kept, from the link's origin and in its axes [m]
+    keeps_m: Sequence[float] = (0.0, 0.0, 0.0)
     # whether it has no armature, and that of motors comes by :class:`.armature.Armature`
     late_armature: bool = False
     links: tuple[str, ...]  # names of the robot's links, the base first
@@ -252,7 +253,7 @@ class Engine(ABC):
             name=self.name,
             contact=self._contact_name,
             substeps=self.contact.substeps,
-            keeps_com=self.keeps_com,
+            keeps_m=list(self.keeps_m),
             friction=sorted({foot * block for foot in feet for block in kept.ground_friction}),
             mass_kg=kept.mass_kg,
             inertia_error=float(np.abs(real - due).max()),

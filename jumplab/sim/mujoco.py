@@ -72,7 +72,6 @@ class MujocoEngine(Engine):
 
     name = "mujoco"
     title = "MuJoCo"
-    keeps_com = False
     known: ClassVar = {"hard": HARD, "usual": Contact()}
     contact: Contact
 
