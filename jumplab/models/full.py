@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
-from jumplab.robot.contact import Anchor, PointMotion, moving, on_feet, point_motion
+from jumplab.robot.contact import Anchor, PointMotion, moving, on_feet, point_motion, posed
 from jumplab.robot.reduction import EXACT_M, mirror
 
 PARALLEL_TOLERANCE = 1e-6  # how far the y axis of a foot may be off the base's
@@ -138,13 +138,12 @@ class FullBody:
     def __init__(self, robot: Robot):
         self.robot = robot
         self.model = robot.model
-        self.data = self.model.createData()
+        self.data = posed(self.model)
         self.nq = self.model.nq
         self.nv = self.model.nv
         self.mass = robot.total_mass
         self.motors = robot.limits
         self.gravity = -float(self.model.gravity.linear[2])
-        pin.framesForwardKinematics(self.model, self.data, pin.neutral(self.model))
         self._check_feet()
         self.anchors = self._all_anchors()
         self.pairs = self._mirrored_pairs()

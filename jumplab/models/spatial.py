@@ -20,6 +20,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from jumplab.errors import RobotError
+from jumplab.robot.contact import posed
 from jumplab.robot.locked import LockedJoint
 from jumplab.robot.reduction import EXACT_M, mirror
 from jumplab.task import GRAVITY
@@ -74,44 +75,39 @@ class SpatialModel:
 
     def __init__(self, model: pin.Model):
         self.model = model
-        if (
-            model.joints[1].shortname() != "JointModelFreeFlyer"
-            or model.nv - 6 != model.njoints - 2
-        ):
+        free = model.joints[1].shortname() == "JointModelFreeFlyer"
+        if not free or model.nv - 6 != model.njoints - 2:
             raise RobotError(
                 f"robot {model.name}: the spatial model needs a free base and joints of one degree "
                 f"of freedom each"
             )
-        data = model.createData()
-        pin.computeJointJacobians(model, data, pin.neutral(model))
-        frames = {0: np.eye(3)}
+        data = posed(model)
+        frames = [np.eye(3)] * 2  # of the world and the base, then of each joint
+        axes = [1]
+        for j in range(2, model.njoints):
+            axis, frame = self._joint(data, j)
+            axes.append(axis)
+            frames.append(frame)
         self.bodies = []
-        for j in range(1, model.njoints):
-            axis, axes = (1, np.eye(3)) if j == 1 else self._joint(data, j)
-            frames[j] = axes
-            above = frames[model.parents[j]]
+        for j, (axis, own) in enumerate(zip(axes, frames[1:], strict=True), start=1):
+            above = frames[model.parents[j]].T
             placement = model.jointPlacements[j]
-            inertia = pin.SE3(axes.T, np.zeros(3)).act(model.inertias[j])
+            inertia = pin.SE3(own.T, np.zeros(3)).act(model.inertias[j])
             lever = pin.skew(inertia.lever)
-            second = inertia.inertia - inertia.mass * lever @ lever
-            self.bodies.append(
-                Link(
-                    model.names[j],
-                    max(0, model.parents[j] - 1),
-                    axis,
-                    _clean(above.T @ placement.rotation @ axes),
-                    _clean(above.T @ placement.translation),
-                    axes,
-                    inertia.mass,
-                    _clean(inertia.mass * inertia.lever),
-                    _clean(second),
-                )
+            link = Link(
+                model.names[j],
+                max(0, model.parents[j] - 1),
+                axis,
+                _clean(above @ placement.rotation @ own),
+                _clean(above @ placement.translation),
+                own,
+                inertia.mass,
+                _clean(inertia.mass * inertia.lever),
+                _clean(inertia.inertia - inertia.mass * lever @ lever),
             )
+            self.bodies.append(link)
         self.mass = float(sum(b.mass for b in self.bodies))
-        self.carried = [b.mass for b in self.bodies]
-        for k in range(len(self.bodies) - 1, 0, -1):
-            self.carried[self.bodies[k].parent] += self.carried[k]
-        pin.centerOfMass(model, data, pin.neutral(model))
+        self.carried = [*data.mass[1:]]
         middles = zip(data.oMi[1:], data.com[1:], strict=True)
         self._aside_m = [place.act(com)[1] for place, com in middles]  # of all that a joint carries
         self.joints = len(self.bodies) - 1
@@ -122,11 +118,8 @@ class SpatialModel:
         """The axis of a joint, and its frame, see :func:`_frame_along`."""
         model = self.model
         way = pin.getJointJacobian(model, data, j, pin.ReferenceFrame.LOCAL)[:, model.idx_vs[j]]
-        if (
-            model.nqs[j] != 1
-            or abs(np.linalg.norm(way[3:]) - 1) > 1e-9
-            or np.abs(way[:3]).max() > 1e-9
-        ):
+        turns = np.abs(way[:3]).max() <= 1e-9 and abs(np.linalg.norm(way[3:]) - 1) <= 1e-9
+        if model.nqs[j] != 1 or not turns:
             raise RobotError(
                 f"robot {model.name}: joint {model.names[j]!r} must be revolute and have a range"
             )

@@ -90,6 +90,18 @@ def on_feet(robot: Robot, point: np.ndarray) -> list[Anchor]:
     return [Anchor(frame.parentJoint, frame.placement * move) for frame in frames]
 
 
+def posed(model: pin.Model, q: np.ndarray | None = None) -> pin.Data:
+    """New data of a model at ``q`` (nq,), or with all joints at 0: places of joints and frames,
+    Jacobians ``J`` (6, nv) in the world's axes, mass and centre of all that each joint carries.
+    """
+    data = model.createData()
+    q = pin.neutral(model) if q is None else q
+    pin.centerOfMass(model, data, q)
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    return data
+
+
 @dataclass(frozen=True, eq=False)
 class PointMotion:
     """Motion of a point of a link, in world axes.

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot.contact import on_feet
+from jumplab.robot.contact import on_feet, posed
 
 if TYPE_CHECKING:  # a robot is asked by this what it is
     from jumplab.robot.description import Robot
@@ -31,10 +31,9 @@ def mirror(model: pin.Model, most_m: float = SAME_M) -> list[tuple[int, int, flo
     ``v[6 + other] = sign * v[6 + one]``. Places may differ by ``most_m`` [m], axes by as many
     radians.
     """
-    data = model.createData()
+    data = posed(model)
     flip = np.array([1.0, -1.0, 1.0])
-    jacobian = pin.computeJointJacobians(model, data, pin.neutral(model))
-    axis = jacobian[3:, 6:].T
+    axis = data.J[3:, 6:].T
     place = np.array([data.oMi[j].translation for j in range(2, model.njoints)])
     pairs = []
     for i in range(len(axis)):
@@ -57,11 +56,9 @@ def in_plane(robot: Robot) -> bool:
     in_legs = {j for foot in feet for j in model.supports[foot.joint]}
     roles = {name for pair in robot.joints.values() for name in pair}
     free = {model.names[j] for j in range(2, model.njoints) if j not in in_legs} - roles
-    data = model.createData()
-    axes = pin.computeJointJacobians(model, data, pin.neutral(model))[4]
-    soles = [data.oMi[foot.joint] * foot.placement for foot in feet]
-    level = max(abs(sole.rotation[2, 0]) for sole in soles) < EXACT_M
-    pitch = [axes[model.idx_vs[model.getJointId(name)]] for name in roles]
+    data = posed(model)
+    level = max(abs(foot.place(data).rotation[2, 0]) for foot in feet) < EXACT_M
+    pitch = [data.J[4, model.idx_vs[model.getJointId(name)]] for name in roles]
     try:
         _ = robot.sagittal
     except RobotError:  # left and right share no angle

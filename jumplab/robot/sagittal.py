@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.robot.contact import posed
 from jumplab.robot.files import ROLES
 from jumplab.robot.motors import MotorLimits, read_only
 
@@ -144,10 +145,7 @@ def _axis_signs(model: pin.Model, data: pin.Data, role: str, pair) -> list[float
     """+1 if a joint turns its limb about +y in the neutral pose, -1 if about -y."""
     signs = []
     for name in pair:
-        joint = model.getJointId(name)
-        # (6, nv)
-        jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-        axis = jacobian[3:, model.idx_vs[joint]]
+        axis = data.J[3:, model.idx_vs[model.getJointId(name)]]
         if abs(axis[1]) < PITCH_AXIS:
             raise RobotError(
                 f"role {role}: joint {name!r} turns about {np.round(axis, 3)}, not about the "
@@ -201,10 +199,7 @@ def reduce(robot: Robot) -> SagittalModel:
     model = robot.model
     joints = robot.joints
     foot = robot.foot
-    data = model.createData()
-    q = pin.neutral(model)
-    pin.computeJointJacobians(model, data, q)
-    pin.framesForwardKinematics(model, data, q)
+    data = posed(model)
     below = {"ankle_pitch": 0, "knee": 1, "hip_pitch": 2, "shoulder_pitch": 4}  # rows of the links
     starts = {model.getJointId(n): i for role, i in below.items() for n in joints[role]}
     link = [

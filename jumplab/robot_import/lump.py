@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.robot.contact import posed
 from jumplab.robot.files import LEG, entry, table
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.roles import leg_joints, robot_axes
@@ -169,7 +170,8 @@ def _levelled(tree: Tree, config: dict, roles: RoleJoints, model: pin.Model) -> 
     {} if they are 0 in the file.
     """
     pitch = entry(config, "feet", "level_rad", default=0.0)
-    axes = pin.computeJointJacobians(model, model.createData(), pin.neutral(model))[3:].T
+    data = posed(model)
+    axes = data.J[3:].T
     out = {}
     for name in roles["ankle_pitch"] if pitch else ():
         joint = model.getJointId(name)
@@ -375,8 +377,8 @@ def _bodies(
     The middle of the left sole is ``beside`` [m] the origin of its link, to the left; that of the
     right one is opposite.
     """
-    data = model.createData()
-    axes = pin.computeJointJacobians(model, data, pin.neutral(model))[3:].T
+    data = posed(model)
+    axes = data.J[3:].T
     carriers = {link: model.frames[i].parentJoint for link, i in links_of(model).items()}
     bodies = []
     names = {}

@@ -25,6 +25,7 @@ from jumplab import reading
 from jumplab.errors import RobotError
 from jumplab.io.progress import tell
 from jumplab.robot.changes import MOMENTS
+from jumplab.robot.contact import posed
 from jumplab.robot.files import read_text
 from jumplab.robot.sagittal import box_corners
 from jumplab.robot_import.write import HERE
@@ -398,10 +399,9 @@ class Tree:
             self.model.addFrame(frame)
             below = [j for j in self.joints.values() if j.parent == link]
             todo += [(j.child, carrier, place * j.place, j.name, j.kind, j.axis) for j in below]
-        data = self.model.createData()
         self.mass = pin.computeTotalMass(self.model)
-        pin.computeSubtreeMasses(self.model, data)
-        self._masses = list(data.mass)
+        data = posed(self.model)
+        self._masses = [*data.mass]
         self.pose = link_poses(self.model)
 
     def error(self, text: str) -> RobotError:
@@ -516,8 +516,7 @@ def links_of(model: pin.Model) -> dict[str, int]:
 
 def link_poses(model: pin.Model) -> dict[str, pin.SE3]:
     """Place of every link [m] in the world with all joints at 0, by name."""
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    data = posed(model)
     return {name: data.oMf[i].copy() for name, i in links_of(model).items()}
 
 
