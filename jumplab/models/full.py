@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
-from jumplab.robot.contact import Anchor, PointMotion, moving, on_feet, point_motion, posed
+from jumplab.robot.contact import Anchor, PointMotion, moving, on_feet, point_motion, posed, shifted
 from jumplab.robot.reduction import EXACT_M, mirror
 
 PARALLEL_TOLERANCE = 1e-6  # how far the y axis of a foot may be off the base's
@@ -172,7 +172,7 @@ class FullBody:
             shoulder = self.model.getJointId(joint)
             x, z = robot.sagittal.points["hand"][1]
             way = self.data.oMi[shoulder].rotation.T @ [x, 0.0, z]
-            anchors.setdefault(f"{side}_hand", Anchor(shoulder, pin.SE3(np.eye(3), way)))
+            anchors.setdefault(f"{side}_hand", Anchor(shoulder, shifted(way)))
         return anchors
 
     def _mirrored_pairs(self) -> dict[str, list[tuple[int, int, float]]]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # a robot is asked by this what it is
 # cosine: with axes canted by 2.6 deg the five links miss the CoM by a millimetre, as the audit
 # allows
 PARALLEL = 0.999
+MIRROR = np.array([1.0, -1.0, 1.0])  # times a vector: its mirror image
 SAME_M = 0.02  # between a joint and the mirror image of its counterpart: built alike; evened out
 EXACT_M = 1e-6
 EXACT_SHARE = 1e-5  # of a body's mass, and of its centre [m], to its counterpart's
@@ -32,13 +33,12 @@ def mirror(model: pin.Model, most_m: float = SAME_M) -> list[tuple[int, int, flo
     radians.
     """
     data = posed(model)
-    flip = np.array([1.0, -1.0, 1.0])
     axis = data.J[3:, 6:].T
     place = np.array([data.oMi[j].translation for j in range(2, model.njoints)])
     pairs = []
     for i in range(len(axis)):
-        signs = np.where(-axis @ (flip * axis[i]) > 0, 1.0, -1.0)
-        gaps = np.hstack([flip * place[i] - place, signs[:, None] * flip * axis[i] + axis])
+        signs = np.where(-axis @ (MIRROR * axis[i]) > 0, 1.0, -1.0)
+        gaps = np.hstack([MIRROR * place[i] - place, signs[:, None] * MIRROR * axis[i] + axis])
         gaps = np.abs(gaps).max(axis=1)
         k = int(np.argmin(gaps))
         if gaps[k] < most_m and k >= i:
@@ -72,7 +72,7 @@ def even_masses(model: pin.Model, pairs: list[tuple[int, int, float]]) -> bool:
     """Whether the base and mirrored bodies, rows (i, k, sign), have mirrored masses and centres."""
     for i, k in [(-1, -1), *(pair[:2] for pair in pairs)]:  # -1 is the base
         left, right = (model.inertias[2 + joint] for joint in (i, k))
-        apart = np.abs(left.lever * [1.0, -1.0, 1.0] - right.lever).max() * left.mass
+        apart = np.abs(MIRROR * left.lever - right.lever).max() * left.mass
         if max(abs(left.mass - right.mass), apart) > EXACT_SHARE * left.mass:
             return False
     return True

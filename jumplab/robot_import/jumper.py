@@ -20,9 +20,9 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.forms import filled
+from jumplab.robot.contact import shifted
 from jumplab.robot.description import Robot
 from jumplab.robot.files import (
-    LEG,
     STANCE,
     TABLES,
     check_entries,
@@ -39,7 +39,6 @@ from jumplab.robot_import.write import (
     add_boxes,
     add_joint,
     add_link,
-    shifted,
 )
 
 # None of these numbers is printed by the paper. Boxes have the default robot's proportions, as
@@ -170,7 +169,7 @@ def _sole(tree: Tree, config: dict, offset: np.ndarray) -> dict[str, float]:
 def _cut_hips(lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> None:
     """Cut hip ranges to where boxes of thigh and trunk meet; canted hips keep theirs."""
     cut = 0.0
-    for leg in zip(*(lumped.moved_by(roles[role]) for role in LEG), strict=True):
+    for leg in lumped.legs(roles):
         hip, *_ = leg
         thigh, _ = _thigh_and_shank(lumped, *leg)
         trunk = _solids(lumped.trunk, boxes, hip, 0.0)
@@ -206,7 +205,7 @@ def _gap(one: list[tuple], other: list[tuple]) -> float:
 def _urdf(name: str, lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> str:
     robot = ET.Element("robot", name=name)
     trunk, *others = lumped.bodies.values()
-    hip = np.mean([body.place for body in lumped.moved_by(roles["hip_pitch"])], axis=0)
+    hip = np.mean([hip.place for hip, _, _ in lumped.legs(roles)], axis=0)
     _add_trunk(robot, trunk, boxes[trunk.name], hip - trunk.place)
     for body in others:
         _add_body(robot, body.name, body.inertia, boxes[body.name])
@@ -240,9 +239,8 @@ def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
             add_joint(robot, joint.name, kind, ends, model.jointPlacements[k], joint.axis, limits)
         todo += below
         boxed = next((part for part in tree.bodies[carrier] if part in boxes), None)
-        axes = (
-            lumped.placed[link].inverse() * shifted(lumped.bodies[boxed].place) if boxed else HERE
-        )
+        place = shifted(lumped.bodies[boxed].place) if boxed else lumped.placed[link]
+        axes = lumped.placed[link].actInv(place)
         _add_body(robot, link, model.inertias[carrier], boxes.get(boxed, []), axes=axes)
     ET.indent(robot)
     place = shifted(-trunk.place) * lumped.placed[root]
@@ -308,7 +306,7 @@ def _boxes(
     config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float]
 ) -> dict[str, Boxes]:
     """Boxes of trunk, and of left and right thigh, shank, foot and arm, by the name of the body."""
-    legs = list(zip(*(lumped.moved_by(roles[role]) for role in LEG), strict=True))
+    legs = lumped.legs(roles)
     leg = float(np.linalg.norm((legs[0][0].place - legs[0][2].place)[[0, 2]]))
     width = {}
     for part, share in THICKNESS.items():
@@ -425,10 +423,10 @@ def _toml(
     motors = {}
     for key in MOTOR:
         limits = {b.joint: b.limits for b in lumped.bodies.values() if key in b.limits}
-        if key in RATIOS:  # speeds as shares of the speed limit
-            values = {joint: x[key] / x["velocity"] for joint, x in limits.items()}
-        else:
-            values = {joint: x[key] for joint, x in limits.items()}
+        # speeds as shares of the speed limit
+        values = {
+            joint: x[key] / (x["velocity"] if key in RATIOS else 1) for joint, x in limits.items()
+        }
         motors[RATIOS.get(key, key)] = values
     return filled(
         "robot_import/jumper.toml.in",

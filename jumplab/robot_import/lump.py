@@ -7,7 +7,7 @@ and directions of the moving joints are kept.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -15,15 +15,15 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot.contact import posed
+from jumplab.robot.contact import posed, shifted
 from jumplab.robot.files import LEG, entry, table
+from jumplab.robot.reduction import MIRROR
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.roles import leg_joints, robot_axes
 from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Joint, Tree, link_poses, links_of
-from jumplab.robot_import.write import key, listed, shifted
+from jumplab.robot_import.write import key, listed
 
 RoleJoints = dict[str, tuple[str, ...]]
-MIRROR = np.array([1.0, -1.0, 1.0])  # times a vector: its mirror image
 IMAGE = np.outer([1.0, -1.0, 1.0, 1.0], [1.0, -1.0, 1.0, 1.0])  # times a (4, 4) pseudo-inertia
 # as in the default robot; MuJoCo refuses zero
 DUMMY = pin.Inertia(1e-3, np.zeros(3), 1e-6 * np.eye(3))
@@ -82,10 +82,10 @@ class Lumped:
         """The body that carries all others."""
         return next(iter(self.bodies.values()))
 
-    def moved_by(self, joints: Iterable[str]) -> list[Body]:
-        """The bodies that joints (by name) move."""
+    def legs(self, roles: RoleJoints) -> list[list[Body]]:
+        """The bodies that hip, knee and ankle move, of the left and of the right leg."""
         of = {body.joint: body for body in self.bodies.values()}
-        return [of[joint] for joint in joints]
+        return [[of[roles[role][side]] for role in LEG] for side in range(2)]
 
     def place(self, link: str) -> pin.SE3:
         """Place of a link in the frame of its body [m]."""

@@ -29,7 +29,8 @@ from mujoco import mjtTrn as TRANSMISSION
 from mujoco import mjtWrap as WRAP
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed, shifted
+from jumplab.robot.contact import shifted
+from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed
 
 ON_JOINT = [*map(int, (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPARENT))]
 TURNING = [*map(int, (JOINT.mjJNT_HINGE, JOINT.mjJNT_BALL))]

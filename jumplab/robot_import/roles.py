@@ -29,7 +29,7 @@ from jumplab.robot_import.checks import (
     wrong_limits,
 )
 from jumplab.robot_import.feet import Sole, find_sole, refuse_wheel, sole_points, thickness
-from jumplab.robot_import.urdf import MOVING, Joint, Tree, read_urdf
+from jumplab.robot_import.urdf import MOVING, Joint, Tree, across, read_urdf
 from jumplab.robot_import.write import key, listed
 
 # None of these numbers is printed by the paper.
@@ -147,11 +147,10 @@ class _Finder:
         out = []
         for a, b in combinations(chains, 2):
             gap = self.at[b[-1]] - self.at[a[-1]]
-            side = float(gap @ self.lateral)
-            axis = self.axis[b[-1]]  # an origin may lie anywhere on its axis
-            across = gap - side * self.lateral
-            across = across - (across @ axis) * axis
-            mirrored = abs(side) >= SAME_M >= norm(across)
+            side = gap @ self.lateral
+            # an origin may lie anywhere on its axis
+            apart = across(across(gap, self.lateral), self.axis[b[-1]])
+            mirrored = abs(side) >= SAME_M >= norm(apart)
             shared = sum(x is y for x, y in zip(a, b, strict=False))
             if mirrored and shared < len(a) == len(b):
                 pair = (a[shared:], b[shared:])
@@ -185,7 +184,7 @@ class _Finder:
         for joint in pitch[pitch.index(knee) + 1 : pitch.index(ankle)]:
             shank = norm(at[joint] - at[knee])
             foot = at[ankle] - at[joint]
-            flat = abs(foot @ self.up) < norm(foot - (foot @ self.up) * self.up)
+            flat = abs(foot @ self.up) < norm(across(foot, self.up))
             if flat and 0 < norm(foot) < FOOT_LIKE * shank:
                 return hip, knee, joint
         return best
@@ -233,9 +232,9 @@ class _Finder:
         near = TOES * norm(ankle - knee)
 
         def of_ankle(joint: Joint) -> bool:
-            across = self.at[joint] - ankle  # an origin may lie anywhere on its axis
-            across = across - (across @ self.axis[joint]) * self.axis[joint]
-            return norm(across) < near and self.turning(joint) < SWINGS
+            # an origin may lie anywhere on its axis
+            apart = across(self.at[joint] - ankle, self.axis[joint])
+            return norm(apart) < near and self.turning(joint) < SWINGS
 
         still = takewhile(of_ankle, chain[chain.index(three[2]) + 1 :])
         return [three[2], *still][-1].child

@@ -11,14 +11,10 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.forms import toml
+from jumplab.robot.contact import shifted
 
 MOST_NAMES = 6  # that a sentence lists
 HERE = pin.SE3.Identity()
-
-
-def shifted(place: np.ndarray) -> pin.SE3:
-    """Axes that are not turned, at ``place`` (3,) [m]."""
-    return pin.SE3(np.eye(3), np.array(place, float))
 
 
 def add(parent: ET.Element, tag: str, **values: Any) -> ET.Element:
