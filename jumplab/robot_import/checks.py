@@ -109,8 +109,8 @@ def _named(
 
 
 def notes(tree: Tree) -> Iterator[str]:
-    """Notes on a URDF without faults: leftovers that are ignored, and harmless defects that are
-    repaired.
+    """Notes on a URDF without faults: leftovers that are ignored, harmless defects that are
+    repaired, and what was found on the way.
     """
     for element in tree.xml:
         if "xacro" in element.tag:
@@ -143,6 +143,7 @@ def notes(tree: Tree) -> Iterator[str]:
     if still:
         yield f"{_joints(still, 'has', 'have')} no motor (effort = 0): held"
     yield from _losses(moving)
+    yield from dict.fromkeys(tree.notes)
 
 
 def _joints(names: list[str], one: str, many: str) -> str:

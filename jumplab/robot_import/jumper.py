@@ -32,7 +32,7 @@ from jumplab.robot.files import (
     table,
 )
 from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, SAME, Body, Lumped, RoleJoints, lump
-from jumplab.robot_import.roles import AXES
+from jumplab.robot_import.roles import AXES, opposite
 from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
 from jumplab.robot_import.write import (
     HERE,
@@ -81,8 +81,12 @@ def make_jumper(tree: Tree, config: dict) -> tuple[Robot, Lumped]:
             f"robot configuration: 'name' = {name!r} must be a plain file name: pictures and files "
             f"of the robot are called so"
         )
-    config = _facing(config)
     source = source_of(config)
+    forward = source["forward"]
+    facing = entry(config, "source", "facing", kind=str, default="") or forward
+    if facing != forward:
+        config = _turned(config, forward, facing)
+        source["forward"] = facing
     roles = roles_table(config)
     feet = tuple(entry(config, "feet", "links", kind=str, count=2))
     lumped = lump(tree, config, roles, source, feet)
@@ -113,29 +117,24 @@ def source_of(config: dict) -> dict:
         )
     repair = table(config, "source").get("repair", [])
     out["repair"] = repair if isinstance(repair, list) else [repair]
-    if wrong := [word for word in out["repair"] if word not in REPAIRS]:
-        raise RobotError(
-            f"robot configuration: 'source.repair' accepts {', '.join(REPAIRS)}, got {wrong[0]!r}"
-        )
+    for word in out["repair"]:
+        if word not in REPAIRS:
+            raise RobotError(
+                f"robot configuration: 'source.repair' accepts {', '.join(REPAIRS)}, got {word!r}"
+            )
     return out
 
 
-def _facing(config: dict) -> dict:
-    """The configuration of a robot that faces as [source] says: where that is opposite to what was
-    found, its pairs, soles and assumed ranges turned about.
+def _turned(config: dict, forward: str, facing: str) -> dict:
+    """The configuration of a robot that faces the other way than was found: its pairs, soles and
+    assumed ranges are turned about.
     """
-    facing = entry(config, "source", "facing", kind=str, default="")
-    forward = entry(config, "source", "forward", kind=str, default="+x")
-    if facing in ("", forward):
-        return config
-    other = forward.translate(str.maketrans("+-", "-+"))
-    if facing != other:
+    if facing != opposite(forward):
         raise RobotError(
-            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, the "
-            f"two directions in which it can walk"
+            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or "
+            f"{opposite(forward)}, the two directions in which it can walk"
         )
     new = copy.deepcopy(config)
-    new["source"]["forward"] = facing
     new["joints"] |= {role: list(pair[::-1]) for role, pair in roles_table(config).items()}
     feet = new["feet"]
     feet["links"] = entry(config, "feet", "links", kind=str, count=2)[::-1]

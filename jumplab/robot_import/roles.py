@@ -101,6 +101,11 @@ class Roles:
     notes: tuple[str, ...]  # what a person should know, one sentence each
 
 
+def opposite(axis: str) -> str:
+    """A signed axis such as "+x", the other way."""
+    return axis.translate(str.maketrans("+-", "-+"))
+
+
 def robot_axes(frame: np.ndarray, forward: str, up: str) -> np.ndarray:
     """(3, 3) from the axes of the URDF's root to x forward, y left, z up.
 
@@ -509,7 +514,7 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
         leg_m = float(norm((turn @ (hip - ankle))[[0, 2]]))
         sole = find_sole(tree, roles.feet[0], turn, leg_m)
     except RobotError as e:
-        for note in (*notes(tree), *dict.fromkeys(tree.notes)):
+        for note in notes(tree):
             e.add_note(note)
         raise
     asked = {}  # table -> limits that the file lacks
@@ -532,13 +537,13 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
         roles=roles,
         repair=repair,
         sole=sole,
-        other=roles.forward.translate(str.maketrans("+-", "-+")),
+        other=opposite(roles.forward),
         knee=_inside(tree, turn[1], roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
         asked=asked,
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
-    roles = replace(roles, notes=(*notes(tree), *dict.fromkeys(tree.notes), *roles.notes))
+    roles = replace(roles, notes=(*notes(tree), *roles.notes))
     return Draft(config, roles, sole, tree, tuple(faults))
 
 
