@@ -190,11 +190,9 @@ class FullBody:
         The paper's "sum of both hip joints = 0" holds for the joints with sign -1 (yaw and roll
         with axes that are not mirrored); for pitch the sign is +1 and the row is a difference.
         """
-        rows = np.zeros((len(self.pairs[phase]), self.nv))
-        for row, (left, right, sign) in zip(rows, self.pairs[phase], strict=True):
-            row[right] = 1.0
-            row[left] = -sign
-        return rows
+        unit = np.eye(self.nv)
+        rows = [unit[right] - sign * unit[left] for left, right, sign in self.pairs[phase]]
+        return np.reshape(rows, (-1, self.nv))
 
     def terms(self, q: np.ndarray, v: np.ndarray) -> FullTerms:
         """All quantities at configuration ``q`` (nq,) and rates ``v`` (nv,)."""

@@ -453,21 +453,17 @@ class _Writer:
         """Links with the joints above them, then what is between joints, and what is left out."""
         for i in self.bodies:
             joints = [int(k) for k in np.flatnonzero(self.model.jnt_bodyid == i)]
-            if i == self.root:
-                self._free(joints)
-            else:
+            base = [k for k in joints if self.model.jnt_type[k] != JOINT.mjJNT_FREE]
+            if i != self.root:
                 self._add_joints(i, joints)
+            elif base:
+                self.notes.append(
+                    f"the joints {self._joints(base)} join the body {self.names[i]!r} to the "
+                    f"world: left out, it moves freely"
+                )
             self._add_link(i)
         self._add_equalities()
         self._note_what_is_left_out()
-
-    def _free(self, joints: list[int]) -> None:
-        """Note the joints of the root that are not added: it moves freely."""
-        if base := [k for k in joints if self.model.jnt_type[k] != JOINT.mjJNT_FREE]:
-            self.notes.append(
-                f"the joints {self._joints(base)} join the body {self.names[self.root]!r} to the "
-                f"world: left out, it moves freely"
-            )
 
     def _add_joints(self, i: int, joints: list[int]) -> None:
         """The joints above a body, with links without mass between several."""
