@@ -238,8 +238,8 @@ def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
             add_joint(robot, joint.name, kind, ends, model.jointPlacements[k], joint.axis, limits)
         todo += below
         boxed = next((part for part in tree.bodies[carrier] if part in boxes), None)
-        place = shifted(lumped.bodies[boxed].place) if boxed else lumped.placed[link]
-        axes = lumped.placed[link].actInv(place)
+        place = shifted(lumped.bodies[boxed].place) if boxed else HERE
+        axes = lumped.placed[link].inverse() * place
         _add_body(robot, link, model.inertias[carrier], boxes.get(boxed, []), axes=axes)
     ET.indent(robot)
     place = shifted(-trunk.place) * lumped.placed[root]

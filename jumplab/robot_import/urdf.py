@@ -241,7 +241,7 @@ def placed(place: pin.SE3, points: np.ndarray) -> np.ndarray:
 
 
 def across(vector: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """What is left of a ``vector`` (3,) without its part along a unit ``axis`` (3,)."""
+    """A ``vector`` (3,) without its part along a unit ``axis`` (3,)."""
     return vector - (vector @ axis) * axis
 
 
