@@ -403,47 +403,39 @@ def limit_faults(
     """
     if wrong := wrong_limits(tree, joint, given):
         link = ";" if tree.format == "MJCF" else ", or"
-        advice = f"{link} give {', '.join(keys_of(wrong))} in [{table}] of the configuration"
-        sentence = "; ".join(wrong.values()) + (advice if table else "")
-        yield f"{tree.where}: joint {joint!r}: {sentence}"
-
-
-def keys_of(wrong: dict[tuple[str, ...], str]) -> list[str]:
-    """The limits that complaints are about, in the order of :data:`LIMITS`."""
-    return [key for key in LIMITS if any(key in group for group in wrong)]
+        keys = ", ".join(sorted(wrong, key=LIMITS.index))
+        advice = f"{link} give {keys} in [{table}] of the configuration" if table else ""
+        sentences = "; ".join(dict.fromkeys(wrong.values()))
+        yield f"{tree.where}: joint {joint!r}: {sentences}{advice}"
 
 
 def wrong_limits(
     tree: Tree, joint: str, given: Mapping[str, float] = MappingProxyType({})
-) -> dict[tuple[str, ...], str]:
-    """Limits of a joint that cannot be meant, or are missing, and what is wrong with them.
+) -> dict[str, str]:
+    """Limits of a joint that cannot be meant, or are missing, and what is wrong with each.
 
     ``given`` values [rad, N m, rad/s] go before those of the file.
     """
     limit = tree.joints[joint].element.find("limit")
     texts = {} if limit is None else limit.attrib
     values = tree.joints[joint].limits | given
-    lost = [key for key in LIMITS if key not in values]
-    absent = tuple(key for key in lost if key not in texts)
+    absent = [key for key in LIMITS if key not in values and key not in texts]
     names = ", ".join(absent)
-    wrong = {}
-    if absent and tree.format == "MJCF":
-        wrong[absent] = "; ".join(dict.fromkeys(IN_MJCF[key] for key in absent))
-    elif absent and limit is None:
-        wrong[absent] = f"has no <limit>; add {names}"
-    elif absent:
-        them = "it" if len(absent) == 1 else "them"
-        wrong[absent] = f"<limit> has no {names}, which Pinocchio reads as 0; add {them}"
-    wrong |= {
-        (key,): f"{key} = {texts[key]!r} must be a finite number" for key in lost if key in texts
-    }
+    them = "it" if len(absent) == 1 else "them"
+    what = f"<limit> has no {names}, which Pinocchio reads as 0; add {them}"
+    if limit is None:
+        what = f"has no <limit>; add {names}"
+    wrong = {key: IN_MJCF[key] if tree.format == "MJCF" else what for key in absent}
+    for key in LIMITS:
+        if key not in values and key in texts:
+            wrong[key] = f"{key} = {texts[key]!r} must be a finite number"
     if sentence := {"lower", "upper"} <= set(values) and _range_fault(**values):
-        wrong["lower", "upper"] = sentence
+        wrong |= {"lower": sentence, "upper": sentence}
     for key, (unit, most, what, remedy) in MOTOR_LIMITS.items():
         value = values.get(key, 1.0)
         fault = "must be positive" if value <= 0 else f"is above {most:g}: {what}"
         if not 0 < value <= most:
-            wrong[key,] = f"{key} = {value:g} {unit} {fault}; give the {remedy}"
+            wrong[key] = f"{key} = {value:g} {unit} {fault}; give the {remedy}"
     return wrong
 
 

@@ -22,14 +22,13 @@ from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import.checks import (
     MOST_RAD,
     MOST_RAD_S,
-    keys_of,
     limit_faults,
     notes,
     read_tree,
     wrong_limits,
 )
 from jumplab.robot_import.feet import Sole, find_sole, refuse_wheel, sole_points, thickness
-from jumplab.robot_import.urdf import MOVING, Joint, Tree, across, read_urdf
+from jumplab.robot_import.urdf import LIMITS, MOVING, Joint, Tree, across, read_urdf
 from jumplab.robot_import.write import key, listed
 
 # None of these numbers is printed by the paper.
@@ -523,8 +522,8 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     for joint in dict.fromkeys(names + leg_joints(tree, roles.trunk, roles.feet)):
         given = roles.assumed.get(joint, {})
         title = f"limits.{key(joint)}"
-        if parts := keys_of(wrong_limits(tree, joint, given)):
-            asked[title] = parts
+        if wrong := wrong_limits(tree, joint, given):
+            asked[title] = sorted(wrong, key=LIMITS.index)
         faults += limit_faults(tree, joint, given, title)
     # a short name of letters, digits, - and _
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
