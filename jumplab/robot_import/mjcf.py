@@ -406,14 +406,14 @@ class _Motors:
             elif kind != TRANSMISSION.mjTRN_BODY:
                 self.pulled[:] = True
             return
-        dof = model.jnt_dofadr[k]
         count = 3 if model.jnt_type[k] == JOINT.mjJNT_BALL else 1
-        for i, gear in enumerate(model.actuator_gear[a, :count]):
-            if gear:
-                self.torque[dof + i] += np.sort(gear * _force(model, a))
-                self.driven[dof + i] = True
-                self.armature[dof + i] += gear**2 * model.actuator_armature[a]
-                self.damping[dof + i] += gear**2 * model.actuator_damping[a]
+        used = np.flatnonzero(model.actuator_gear[a, :count])
+        gear = model.actuator_gear[a, used]
+        dofs = model.jnt_dofadr[k] + used
+        self.torque[dofs] += np.sort(np.outer(gear, _force(model, a)))
+        self.driven[dofs] = True
+        self.armature[dofs] += gear**2 * model.actuator_armature[a]
+        self.damping[dofs] += gear**2 * model.actuator_damping[a]
 
     def effort(self, dof: int) -> float | None:
         """The torque that a joint has both ways [N m], the weaker way; None if nothing says."""

@@ -308,6 +308,9 @@ class Joint:
     mimic: tuple[str, float, float] | None  # leader, multiplier, offset
     driven: bool  # it turns by a motor of its own, between two stops or without
     element: ET.Element = field(repr=False)
+    # with all joints at 0, in the root's frame (3,): its origin [m], and its axis
+    at: np.ndarray = field(init=False)
+    direction: np.ndarray = field(init=False)
 
     @classmethod
     def read(cls, e: ET.Element) -> Joint:
@@ -416,6 +419,10 @@ class Tree:
         data = posed(self.model)
         self._masses = [*data.mass]
         self.pose = link_poses(self.model)
+        for joint in self.joints.values():
+            pose = self.pose[joint.child]
+            joint.at = pose.translation
+            joint.direction = pose.rotation @ joint.axis
 
     def error(self, text: str) -> RobotError:
         """An error that begins with the file's name."""
