@@ -327,8 +327,7 @@ class SpatialState:
             if out:
                 linear, angular = out[b.parent]
                 spin = self._spins[b.parent]
-                arm = ca.DM(b.place)
-                linear = linear + cross(angular, arm) + cross(spin, cross(spin, arm))
+                linear = linear + cross(angular, b.place) + cross(spin, cross(spin, b.place))
             else:
                 linear = self.a[:3] + along(2, self.gravity)
                 angular = spin = ca.SX.zeros(3)
@@ -351,7 +350,7 @@ class SpatialState:
             turned = above
             for turn in turns:
                 turned = turned @ turn.fixed @ turn.turn
-            out.append((turned, place + above @ ca.DM(b.place) if out else place))
+            out.append((turned, place + above @ b.place if out else place))
         return out
 
     # from the ends of the limbs inwards
@@ -420,7 +419,6 @@ class SpatialState:
         """The same of anything that is rigid with a body; see :class:`Link`."""
         spin = self._spins[k]
         linear, angular = self._accelerations[k]
-        first = ca.DM(first)
         second = ca.DM(second)
         force = mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
         moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
@@ -438,7 +436,7 @@ class SpatialState:
         for k in self._counted:
             if self.model.bodies[k].name in joint.joints:
                 total = total + self._at_parent(k, sums[k], abs(joint.place[1]) < EXACT_M)
-        return ca.dot(ca.DM(joint.axis), total[3:] - cross(ca.DM(joint.place), total[:3]))
+        return ca.dot(joint.axis, total[3:] - cross(joint.place, total[:3]))
 
     @cached_property
     def _momenta(self) -> list[ca.SX]:
@@ -450,19 +448,18 @@ class SpatialState:
             b = self.model.bodies[k]
             spin = self._spins[k]
             linear = self._velocities[k]
-            first = ca.DM(b.first)
-            angular = ca.DM(b.second) @ spin + cross(first, linear)
-            parts[k] = ca.vertcat(b.mass * linear + cross(spin, first), angular)
+            angular = ca.DM(b.second) @ spin + cross(b.first, linear)
+            parts[k] = ca.vertcat(b.mass * linear + cross(spin, b.first), angular)
         return self._in_world(self._gathered(parts)[0])
 
     @cached_property
     def com_from_base(self) -> ca.SX:
         """CoM seen from the base's origin (3,) [m], by first moments about the bodies' origins."""
-        parts = {k: ca.SX(ca.DM(self.model.bodies[k].first)) for k in self._counted}
+        parts = {k: ca.SX(self.model.bodies[k].first) for k in self._counted}
         for k in self._counted[:0:-1]:
             b = self.model.bodies[k]
             (turn,) = self._turns[k]
-            more = turn.out(parts[k]) + self.model.carried[k] * ca.DM(b.place)
+            more = turn.out(parts[k]) + self.model.carried[k] * b.place
             if (across := self._doubled(k)) is not None:
                 more = 2 * (more - along(across, more[across]))
             parts[b.parent] += more
@@ -492,7 +489,7 @@ class SpatialState:
         for k in self._counted:
             b = self.model.bodies[k]
             turn, place = self._frames[k]
-            first = turn @ ca.DM(b.first)
+            first = turn @ b.first
             inertia = turn @ ca.DM(b.second) @ turn.T + b.mass * _spread(place, place)
             inertia += _spread(place, first) + _spread(first, place)
             beside = self._even and self.model.across[k] is None
@@ -525,14 +522,14 @@ class SpatialState:
     def point(self, body: int, local: np.ndarray) -> ca.SX:
         """Place of a point of a body (3,) [m], in the world; see :meth:`SpatialModel.local`."""
         turn, origin = self._frames[body]
-        return self.q[:3] + origin + turn @ ca.DM(local)
+        return self.q[:3] + origin + turn @ local
 
     def from_base(self, body: int, local: np.ndarray) -> ca.SX:
         """Place of a point of a body (3,) [m], seen from the base's origin in the base's axes."""
-        place = ca.SX(ca.DM(local))
+        place = ca.SX(local)
         while body:
             (turn,) = self._turns[body]
-            place = turn.out(place) + ca.DM(self.model.bodies[body].place)
+            place = turn.out(place) + self.model.bodies[body].place
             body = self.model.bodies[body].parent
         return place
 
@@ -542,7 +539,7 @@ class SpatialState:
         """
         spin = self._spins[body]
         base = self.rotation(body).T @ self.v[:3]
-        return base + self._velocities[body] + cross(spin, ca.DM(local)), spin
+        return base + self._velocities[body] + cross(spin, local), spin
 
     def own_accelerations(self, body: int, local: np.ndarray) -> tuple[ca.SX, ca.SX]:
         """Acceleration of a point of a body, and angular acceleration of the body (3,) each, in the
@@ -550,9 +547,8 @@ class SpatialState:
         """
         spin = self._spins[body]
         linear, angular = self._accelerations[body]
-        arm = ca.DM(local)
         fall = self.gravity * self.rotation(body)[2, :].T
-        return linear - fall + cross(angular, arm) + cross(spin, cross(spin, arm)), angular
+        return linear - fall + cross(angular, local) + cross(spin, cross(spin, local)), angular
 
     def point_velocity(self, body: int, local: np.ndarray) -> ca.SX:
         """Velocity (3,) of a point of a body [m/s]."""
