@@ -143,7 +143,7 @@ class FullBody:
         self.nv = self.model.nv
         self.mass = robot.total_mass
         self.motors = robot.limits
-        self.gravity = -float(self.model.gravity.linear[2])
+        self.gravity = robot.gravity
         self._check_feet()
         self.anchors = self._all_anchors()
         self.pairs = self._mirrored_pairs()
@@ -202,7 +202,7 @@ class FullBody:
         before, after = (pitch_inertia(model, data, x)[1] for x in around)
         rho, slope = pitch_inertia(model, data, q)
         H = pin.nonLinearEffects(model, data, q, v).copy()
-        H[6:] += self.robot.limits.lost(v[6:])
+        H[6:] += self.motors.lost(v[6:])
         M = pin.crba(model, data, q).copy()
         pin.dccrba(model, data, q, v)
         A_h = data.Ag.copy()

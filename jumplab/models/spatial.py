@@ -296,7 +296,8 @@ class SpatialState:
         joints = [[Turn(q, k, b.axis, b.turn)] for k, b in enumerate(model.bodies[1:], 6)]
         self._turns = [base, *joints]
         self._even = even
-        self._counted = model.left_half if even else tuple(range(len(model.bodies)))
+        counted = model.left_half if even else range(len(model.bodies))
+        self._counted = {k: model.bodies[k] for k in counted}
 
     # from the base outwards, in the bodies' own axes
     # ------------------------------------------------------------------------------------------
@@ -366,8 +367,8 @@ class SpatialState:
         """Force-like and moment-like vectors (6,) at the bodies' origins, in their axes, each with
         those of all bodies beyond."""
         sums = dict(parts)
-        for k in self._counted[:0:-1]:
-            parent = self.model.bodies[k].parent
+        for k in [*self._counted][:0:-1]:
+            parent = self._counted[k].parent
             sums[parent] = sums[parent] + self._at_parent(k, sums[k])
         return sums
 
@@ -412,8 +413,8 @@ class SpatialState:
     def _inertial(self) -> dict[int, ca.SX]:
         """Force, and moment about its origin (6,), that the motion of each body needs, in its
         axes."""
-        counted = {k: self.model.bodies[k] for k in self._counted}
-        return {k: self._inertial_of(k, b.mass, b.first, b.second) for k, b in counted.items()}
+        bodies = self._counted.items()
+        return {k: self._inertial_of(k, b.mass, b.first, b.second) for k, b in bodies}
 
     def _inertial_of(self, k: int, mass: float, first: np.ndarray, second: np.ndarray) -> ca.SX:
         """The same of anything that is rigid with a body; see :class:`Link`."""
@@ -433,8 +434,8 @@ class SpatialState:
         second = part.matrix()[3:, 3:]  # about the origin
         total = self._inertial_of(0, part.mass, part.mass * part.lever, second)
         sums = self._gathered(self._inertial)
-        for k in self._counted:
-            if self.model.bodies[k].name in joint.joints:
+        for k, b in self._counted.items():
+            if b.name in joint.joints:
                 total = total + self._at_parent(k, sums[k], abs(joint.place[1]) < EXACT_M)
         return ca.dot(joint.axis, total[3:] - cross(joint.place, total[:3]))
 
@@ -444,8 +445,7 @@ class SpatialState:
         rests.
         """
         parts = {}
-        for k in self._counted:
-            b = self.model.bodies[k]
+        for k, b in self._counted.items():
             spin = self._spins[k]
             linear = self._velocities[k]
             angular = ca.DM(b.second) @ spin + cross(b.first, linear)
@@ -455,9 +455,9 @@ class SpatialState:
     @cached_property
     def com_from_base(self) -> ca.SX:
         """CoM seen from the base's origin (3,) [m], by first moments about the bodies' origins."""
-        parts = {k: ca.SX(self.model.bodies[k].first) for k in self._counted}
-        for k in self._counted[:0:-1]:
-            b = self.model.bodies[k]
+        parts = {k: ca.SX(b.first) for k, b in self._counted.items()}
+        for k in [*parts][:0:-1]:
+            b = self._counted[k]
             (turn,) = self._turns[k]
             more = turn.out(parts[k]) + self.model.carried[k] * b.place
             if (across := self._doubled(k)) is not None:
@@ -486,8 +486,7 @@ class SpatialState:
         """Inertia (3, 3) of all bodies as one, about the CoM, in world axes [kg m^2]."""
         com = self.com_from_base
         total = -self.model.mass * _spread(com, com)
-        for k in self._counted:
-            b = self.model.bodies[k]
+        for k, b in self._counted.items():
             turn, place = self._frames[k]
             first = turn @ b.first
             inertia = turn @ ca.DM(b.second) @ turn.T + b.mass * _spread(place, place)

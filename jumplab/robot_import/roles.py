@@ -526,7 +526,6 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     config = filled(
         "robot_import/starter.toml.in",
         key=key,
-        notes=roles.notes,
         name=name or "robot",
         urdf=path.resolve().as_posix(),
         roles=roles,
