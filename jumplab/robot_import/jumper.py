@@ -34,12 +34,7 @@ from jumplab.robot.files import (
 from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, SAME, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES, opposite
 from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
-from jumplab.robot_import.write import (
-    HERE,
-    add_boxes,
-    add_joint,
-    add_link,
-)
+from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin
 
 # None of these numbers is printed by the paper. Boxes have the default robot's proportions, as
 # shares of the leg's length from hip to ankle: the trunk's rear, front, half width, bottom and top,
@@ -263,8 +258,11 @@ def _add_body(
 ) -> None:
     """A link with boxes that collide, and boxes only ``seen``, along ``axes`` in it."""
     link = add_link(robot, name, inertia)
-    add_boxes(link, "visual", [*boxes, *seen], axes)
-    add_boxes(link, "collision", boxes, axes)
+    for kind, shown in (("visual", [*boxes, *seen]), ("collision", boxes)):
+        for centre, size in shown:
+            shape = add(link, kind)
+            add_origin(shape, axes * shifted(centre))
+            add(add(shape, "geometry"), "box", size=size)
 
 
 def _add_trunk(robot: ET.Element, body: Body, boxes: Boxes, hip: np.ndarray) -> None:

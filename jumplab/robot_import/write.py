@@ -65,19 +65,6 @@ def add_link(robot: ET.Element, name: str, inertia: pin.Inertia) -> ET.Element:
     return link
 
 
-def add_boxes(
-    link: ET.Element,
-    kind: str,
-    boxes: Iterable[tuple[np.ndarray, np.ndarray]],
-    axes: pin.SE3 = HERE,
-) -> None:
-    """Boxes (centre, size) [m] along ``axes`` in the link; ``kind`` is "visual" or "collision"."""
-    for centre, size in boxes:
-        shape = add(link, kind)
-        add_origin(shape, axes * shifted(centre))
-        add(add(shape, "geometry"), "box", size=size)
-
-
 def listed(names: Iterable[Any]) -> str:
     """Names, or numbers, in quotes for a sentence, the first of many."""
     quoted = [*map(repr, names)]
