@@ -422,10 +422,10 @@ def wrong_limits(
     absent = [key for key in LIMITS if key not in values and key not in texts]
     names = ", ".join(absent)
     them = "it" if len(absent) == 1 else "them"
-    what = f"<limit> has no {names}, which Pinocchio reads as 0; add {them}"
+    lacking = f"<limit> has no {names}, which Pinocchio reads as 0; add {them}"
     if limit is None:
-        what = f"has no <limit>; add {names}"
-    wrong = {key: IN_MJCF[key] if tree.format == "MJCF" else what for key in absent}
+        lacking = f"has no <limit>; add {names}"
+    wrong = {key: IN_MJCF[key] if tree.format == "MJCF" else lacking for key in absent}
     for key in LIMITS:
         if key not in values and key in texts:
             wrong[key] = f"{key} = {texts[key]!r} must be a finite number"

@@ -279,10 +279,10 @@ def _leave_out(
     for part in [*pairs, *geoms, *meshes]:
         spec.delete(part)
     where = f" of {listed(bodies)}" if bodies else ""
-    what, are = ("mesh", "is") if len(files) == 1 else ("meshes", "are")
-    notes.append(
-        f"the {what} {listed(files.values())}{where} {are} not there or cannot be read: left out"
-    )
+    what = f"the mesh {listed(files.values())}{where} is"
+    if len(files) > 1:
+        what = f"the meshes {listed(files.values())}{where} are"
+    notes.append(f"{what} not there or cannot be read: left out")
 
 
 def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
@@ -346,9 +346,8 @@ def _loops(model: mujoco.MjModel) -> Iterator[_Loop]:
             ends = model.site_bodyid[ends].tolist()
         one, two = ({*_up(model, body)} for body in ends)
         there = [np.isin(model.jnt_bodyid, [*way]) for way in (one - two, two - one)]
-        ways, joints = (
-            [np.flatnonzero(x & kind).tolist() for x in there] for kind in (hinges, True)
-        )
+        ways = [np.flatnonzero(way & hinges).tolist() for way in there]
+        joints = [np.flatnonzero(way).tolist() for way in there]
         yield _Loop(model.equality(e).name or str(e), ends, ways, joints)
 
 
