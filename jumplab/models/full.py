@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
-from jumplab.robot.contact import Anchor, PointMotion, moving, on_feet, point_motion
+from jumplab.robot.contact import Anchor, PointMotion, moving, on_feet, point_motion, posed, shifted
 from jumplab.robot.reduction import EXACT_M, mirror
 
 PARALLEL_TOLERANCE = 1e-6  # how far the y axis of a foot may be off the base's
@@ -138,13 +138,12 @@ class FullBody:
     def __init__(self, robot: Robot):
         self.robot = robot
         self.model = robot.model
-        self.data = self.model.createData()
+        self.data = posed(self.model)
         self.nq = self.model.nq
         self.nv = self.model.nv
         self.mass = robot.total_mass
         self.motors = robot.limits
-        self.gravity = -float(self.model.gravity.linear[2])
-        pin.framesForwardKinematics(self.model, self.data, pin.neutral(self.model))
+        self.gravity = robot.gravity
         self._check_feet()
         self.anchors = self._all_anchors()
         self.pairs = self._mirrored_pairs()
@@ -173,7 +172,7 @@ class FullBody:
             shoulder = self.model.getJointId(joint)
             x, z = robot.sagittal.points["hand"][1]
             way = self.data.oMi[shoulder].rotation.T @ [x, 0.0, z]
-            anchors.setdefault(f"{side}_hand", Anchor(shoulder, pin.SE3(np.eye(3), way)))
+            anchors.setdefault(f"{side}_hand", Anchor(shoulder, shifted(way)))
         return anchors
 
     def _mirrored_pairs(self) -> dict[str, list[tuple[int, int, float]]]:
@@ -191,11 +190,9 @@ class FullBody:
         The paper's "sum of both hip joints = 0" holds for the joints with sign -1 (yaw and roll
         with axes that are not mirrored); for pitch the sign is +1 and the row is a difference.
         """
-        rows = np.zeros((len(self.pairs[phase]), self.nv))
-        for row, (left, right, sign) in zip(rows, self.pairs[phase], strict=True):
-            row[right] = 1.0
-            row[left] = -sign
-        return rows
+        unit = np.eye(self.nv)
+        rows = [unit[right] - sign * unit[left] for left, right, sign in self.pairs[phase]]
+        return np.reshape(rows, (-1, self.nv))
 
     def terms(self, q: np.ndarray, v: np.ndarray) -> FullTerms:
         """All quantities at configuration ``q`` (nq,) and rates ``v`` (nv,)."""
@@ -205,7 +202,7 @@ class FullBody:
         before, after = (pitch_inertia(model, data, x)[1] for x in around)
         rho, slope = pitch_inertia(model, data, q)
         H = pin.nonLinearEffects(model, data, q, v).copy()
-        H[6:] += self.robot.limits.lost(v[6:])
+        H[6:] += self.motors.lost(v[6:])
         M = pin.crba(model, data, q).copy()
         pin.dccrba(model, data, q, v)
         A_h = data.Ag.copy()

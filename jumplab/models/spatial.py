@@ -20,6 +20,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from jumplab.errors import RobotError
+from jumplab.robot.contact import posed
 from jumplab.robot.locked import LockedJoint
 from jumplab.robot.reduction import EXACT_M, mirror
 from jumplab.task import GRAVITY
@@ -74,44 +75,39 @@ class SpatialModel:
 
     def __init__(self, model: pin.Model):
         self.model = model
-        if (
-            model.joints[1].shortname() != "JointModelFreeFlyer"
-            or model.nv - 6 != model.njoints - 2
-        ):
+        free = model.joints[1].shortname() == "JointModelFreeFlyer"
+        if not free or model.nv - 6 != model.njoints - 2:
             raise RobotError(
                 f"robot {model.name}: the spatial model needs a free base and joints of one degree "
                 f"of freedom each"
             )
-        data = model.createData()
-        pin.computeJointJacobians(model, data, pin.neutral(model))
-        frames = {0: np.eye(3)}
+        data = posed(model)
+        frames = [np.eye(3)] * 2  # of the world and the base, then of each joint
+        axes = [1]
+        for j in range(2, model.njoints):
+            axis, frame = self._joint(data, j)
+            axes.append(axis)
+            frames.append(frame)
         self.bodies = []
-        for j in range(1, model.njoints):
-            axis, axes = (1, np.eye(3)) if j == 1 else self._joint(data, j)
-            frames[j] = axes
-            above = frames[model.parents[j]]
+        for j, (axis, own) in enumerate(zip(axes, frames[1:], strict=True), start=1):
+            above = frames[model.parents[j]].T
             placement = model.jointPlacements[j]
-            inertia = pin.SE3(axes.T, np.zeros(3)).act(model.inertias[j])
+            inertia = pin.SE3(own.T, np.zeros(3)).act(model.inertias[j])
             lever = pin.skew(inertia.lever)
-            second = inertia.inertia - inertia.mass * lever @ lever
-            self.bodies.append(
-                Link(
-                    model.names[j],
-                    max(0, model.parents[j] - 1),
-                    axis,
-                    _clean(above.T @ placement.rotation @ axes),
-                    _clean(above.T @ placement.translation),
-                    axes,
-                    inertia.mass,
-                    _clean(inertia.mass * inertia.lever),
-                    _clean(second),
-                )
+            link = Link(
+                model.names[j],
+                max(0, model.parents[j] - 1),
+                axis,
+                _clean(above @ placement.rotation @ own),
+                _clean(above @ placement.translation),
+                own,
+                inertia.mass,
+                _clean(inertia.mass * inertia.lever),
+                _clean(inertia.inertia - inertia.mass * lever @ lever),
             )
+            self.bodies.append(link)
         self.mass = float(sum(b.mass for b in self.bodies))
-        self.carried = [b.mass for b in self.bodies]
-        for k in range(len(self.bodies) - 1, 0, -1):
-            self.carried[self.bodies[k].parent] += self.carried[k]
-        pin.centerOfMass(model, data, pin.neutral(model))
+        self.carried = [*data.mass[1:]]
         middles = zip(data.oMi[1:], data.com[1:], strict=True)
         self._aside_m = [place.act(com)[1] for place, com in middles]  # of all that a joint carries
         self.joints = len(self.bodies) - 1
@@ -122,11 +118,8 @@ class SpatialModel:
         """The axis of a joint, and its frame, see :func:`_frame_along`."""
         model = self.model
         way = pin.getJointJacobian(model, data, j, pin.ReferenceFrame.LOCAL)[:, model.idx_vs[j]]
-        if (
-            model.nqs[j] != 1
-            or abs(np.linalg.norm(way[3:]) - 1) > 1e-9
-            or np.abs(way[:3]).max() > 1e-9
-        ):
+        turns = np.abs(way[:3]).max() <= 1e-9 and abs(np.linalg.norm(way[3:]) - 1) <= 1e-9
+        if model.nqs[j] != 1 or not turns:
             raise RobotError(
                 f"robot {model.name}: joint {model.names[j]!r} must be revolute and have a range"
             )
@@ -303,7 +296,8 @@ class SpatialState:
         joints = [[Turn(q, k, b.axis, b.turn)] for k, b in enumerate(model.bodies[1:], 6)]
         self._turns = [base, *joints]
         self._even = even
-        self._counted = model.left_half if even else tuple(range(len(model.bodies)))
+        counted = model.left_half if even else range(len(model.bodies))
+        self._counted = {k: model.bodies[k] for k in counted}
 
     # from the base outwards, in the bodies' own axes
     # ------------------------------------------------------------------------------------------
@@ -334,8 +328,7 @@ class SpatialState:
             if out:
                 linear, angular = out[b.parent]
                 spin = self._spins[b.parent]
-                arm = ca.DM(b.place)
-                linear = linear + cross(angular, arm) + cross(spin, cross(spin, arm))
+                linear = linear + cross(angular, b.place) + cross(spin, cross(spin, b.place))
             else:
                 linear = self.a[:3] + along(2, self.gravity)
                 angular = spin = ca.SX.zeros(3)
@@ -358,7 +351,7 @@ class SpatialState:
             turned = above
             for turn in turns:
                 turned = turned @ turn.fixed @ turn.turn
-            out.append((turned, place + above @ ca.DM(b.place) if out else place))
+            out.append((turned, place + above @ b.place if out else place))
         return out
 
     # from the ends of the limbs inwards
@@ -374,8 +367,8 @@ class SpatialState:
         """Force-like and moment-like vectors (6,) at the bodies' origins, in their axes, each with
         those of all bodies beyond."""
         sums = dict(parts)
-        for k in self._counted[:0:-1]:
-            parent = self.model.bodies[k].parent
+        for k in [*self._counted][:0:-1]:
+            parent = self._counted[k].parent
             sums[parent] = sums[parent] + self._at_parent(k, sums[k])
         return sums
 
@@ -420,14 +413,13 @@ class SpatialState:
     def _inertial(self) -> dict[int, ca.SX]:
         """Force, and moment about its origin (6,), that the motion of each body needs, in its
         axes."""
-        counted = {k: self.model.bodies[k] for k in self._counted}
-        return {k: self._inertial_of(k, b.mass, b.first, b.second) for k, b in counted.items()}
+        bodies = self._counted.items()
+        return {k: self._inertial_of(k, b.mass, b.first, b.second) for k, b in bodies}
 
     def _inertial_of(self, k: int, mass: float, first: np.ndarray, second: np.ndarray) -> ca.SX:
         """The same of anything that is rigid with a body; see :class:`Link`."""
         spin = self._spins[k]
         linear, angular = self._accelerations[k]
-        first = ca.DM(first)
         second = ca.DM(second)
         force = mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
         moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
@@ -442,10 +434,10 @@ class SpatialState:
         second = part.matrix()[3:, 3:]  # about the origin
         total = self._inertial_of(0, part.mass, part.mass * part.lever, second)
         sums = self._gathered(self._inertial)
-        for k in self._counted:
-            if self.model.bodies[k].name in joint.joints:
+        for k, b in self._counted.items():
+            if b.name in joint.joints:
                 total = total + self._at_parent(k, sums[k], abs(joint.place[1]) < EXACT_M)
-        return ca.dot(ca.DM(joint.axis), total[3:] - cross(ca.DM(joint.place), total[:3]))
+        return ca.dot(joint.axis, total[3:] - cross(joint.place, total[:3]))
 
     @cached_property
     def _momenta(self) -> list[ca.SX]:
@@ -453,23 +445,21 @@ class SpatialState:
         rests.
         """
         parts = {}
-        for k in self._counted:
-            b = self.model.bodies[k]
+        for k, b in self._counted.items():
             spin = self._spins[k]
             linear = self._velocities[k]
-            first = ca.DM(b.first)
-            angular = ca.DM(b.second) @ spin + cross(first, linear)
-            parts[k] = ca.vertcat(b.mass * linear + cross(spin, first), angular)
+            angular = ca.DM(b.second) @ spin + cross(b.first, linear)
+            parts[k] = ca.vertcat(b.mass * linear + cross(spin, b.first), angular)
         return self._in_world(self._gathered(parts)[0])
 
     @cached_property
     def com_from_base(self) -> ca.SX:
         """CoM seen from the base's origin (3,) [m], by first moments about the bodies' origins."""
-        parts = {k: ca.SX(ca.DM(self.model.bodies[k].first)) for k in self._counted}
-        for k in self._counted[:0:-1]:
-            b = self.model.bodies[k]
+        parts = {k: ca.SX(b.first) for k, b in self._counted.items()}
+        for k in [*parts][:0:-1]:
+            b = self._counted[k]
             (turn,) = self._turns[k]
-            more = turn.out(parts[k]) + self.model.carried[k] * ca.DM(b.place)
+            more = turn.out(parts[k]) + self.model.carried[k] * b.place
             if (across := self._doubled(k)) is not None:
                 more = 2 * (more - along(across, more[across]))
             parts[b.parent] += more
@@ -496,10 +486,9 @@ class SpatialState:
         """Inertia (3, 3) of all bodies as one, about the CoM, in world axes [kg m^2]."""
         com = self.com_from_base
         total = -self.model.mass * _spread(com, com)
-        for k in self._counted:
-            b = self.model.bodies[k]
+        for k, b in self._counted.items():
             turn, place = self._frames[k]
-            first = turn @ ca.DM(b.first)
+            first = turn @ b.first
             inertia = turn @ ca.DM(b.second) @ turn.T + b.mass * _spread(place, place)
             inertia += _spread(place, first) + _spread(first, place)
             beside = self._even and self.model.across[k] is None
@@ -532,14 +521,14 @@ class SpatialState:
     def point(self, body: int, local: np.ndarray) -> ca.SX:
         """Place of a point of a body (3,) [m], in the world; see :meth:`SpatialModel.local`."""
         turn, origin = self._frames[body]
-        return self.q[:3] + origin + turn @ ca.DM(local)
+        return self.q[:3] + origin + turn @ local
 
     def from_base(self, body: int, local: np.ndarray) -> ca.SX:
         """Place of a point of a body (3,) [m], seen from the base's origin in the base's axes."""
-        place = ca.SX(ca.DM(local))
+        place = ca.SX(local)
         while body:
             (turn,) = self._turns[body]
-            place = turn.out(place) + ca.DM(self.model.bodies[body].place)
+            place = turn.out(place) + self.model.bodies[body].place
             body = self.model.bodies[body].parent
         return place
 
@@ -549,7 +538,7 @@ class SpatialState:
         """
         spin = self._spins[body]
         base = self.rotation(body).T @ self.v[:3]
-        return base + self._velocities[body] + cross(spin, ca.DM(local)), spin
+        return base + self._velocities[body] + cross(spin, local), spin
 
     def own_accelerations(self, body: int, local: np.ndarray) -> tuple[ca.SX, ca.SX]:
         """Acceleration of a point of a body, and angular acceleration of the body (3,) each, in the
@@ -557,9 +546,8 @@ class SpatialState:
         """
         spin = self._spins[body]
         linear, angular = self._accelerations[body]
-        arm = ca.DM(local)
         fall = self.gravity * self.rotation(body)[2, :].T
-        return linear - fall + cross(angular, arm) + cross(spin, cross(spin, arm)), angular
+        return linear - fall + cross(angular, local) + cross(spin, cross(spin, local)), angular
 
     def point_velocity(self, body: int, local: np.ndarray) -> ca.SX:
         """Velocity (3,) of a point of a body [m/s]."""

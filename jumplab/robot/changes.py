@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
@@ -167,28 +167,29 @@ def legs(robot: Robot, factor: float, thigh: float, shank: float) -> tuple[str, 
     Raises :class:`RobotError` as :meth:`.Robot.with_legs` says.
     """
     both = _number(robot, "the factor on the legs", factor)
-    part_factors = {"thighs": thigh, "shanks": shank}
     factors = [
-        both * _number(robot, f"the factor on the {part}", x) for part, x in part_factors.items()
+        both * _number(robot, f"the factor on the {part}", x)
+        for part, x in (("thighs", thigh), ("shanks", shank))
     ]
     root = _parsed(robot)
     remarks = []
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     links = {link.get("name"): link for link in root.findall("link")}
-    ends = (zip(robot.joints[a], robot.joints[b], strict=True) for a, b in pairwise(LEG))
-    for (name, end), factor in zip(chain(*ends), np.repeat(factors, 2), strict=True):
+    ends = [
+        pair for roles in pairwise(LEG) for pair in zip(*map(robot.joints.get, roles), strict=True)
+    ]
+    for (name, end), factor in zip(ends, np.repeat(factors, 2), strict=True):
         link = joints[name].find("child").get("link")
+        hanging = [j for j in joints.values() if j.find("parent").get("link") == link]
         origin = joints[end].find("origin")
         x, y, z = (abs(float(number)) for number in origin.get("xyz").split())
         origins = (*links[link].iter("origin"), origin)
         turns = " ".join(element.get("rpy", "") for element in origins).split()
-        along = joints[end].find("parent").get("link") == link and z >= max(x, y)
-        if not along or any(map(float, turns)):
+        if joints[end] not in hanging or z < max(x, y) or any(map(float, turns)):
             raise robot.error(
                 f"the link {link!r} does not run along its own z; stretch it in its URDF"
             )
         if factor != 1.0:
-            hanging = [j for j in joints.values() if j.find("parent").get("link") == link]
             _stretch(links[link], hanging, factor)
             remarks.append(f"length of link {link!r}, {z:.12g} -> {z * factor:.12g} m")
     return _text(root), remarks
@@ -203,8 +204,8 @@ def _stretch(link: ET.Element, joints: Sequence[ET.Element], factor: float) -> N
     moments = link.find("inertial/inertia")
     xx, yy, zz = (float(moments.get(key)) for key in ("ixx", "iyy", "izz"))
     along = (xx + yy - zz) / 2  # the mass' second moment along z
-    moments.set("ixx", f"{xx + (factor**2 - 1) * along:.12g}")
-    moments.set("iyy", f"{yy + (factor**2 - 1) * along:.12g}")
+    for key, moment in (("ixx", xx), ("iyy", yy)):
+        moments.set(key, f"{moment + (factor**2 - 1) * along:.12g}")
     scale(moments, ("ixz", "iyz"), factor)
 
 

@@ -21,10 +21,8 @@ def pyramid(friction: float) -> np.ndarray:
     """Edges (4, 3) of the friction pyramid, each with a vertical force of one: a force is inside if
     it is a sum of them with factors that are not negative.
     """
-    edges = np.array([[0.0, 0.0, 1.0]] * len(WAYS))
-    for edge, (_, axis, sign) in zip(edges, WAYS, strict=True):
-        edge[axis] = sign * friction
-    return edges
+    x, y, z = np.eye(3)
+    return np.array([z + sign * friction * (x, y)[axis] for _, axis, sign in WAYS])
 
 
 def wrench_rows(
@@ -63,6 +61,11 @@ def wrench_rows(
     return rows
 
 
+def shifted(place: np.ndarray) -> pin.SE3:
+    """Axes that are not turned, at ``place`` (3,) [m]."""
+    return pin.SE3(np.eye(3), np.array(place, float))
+
+
 @dataclass(frozen=True, eq=False)
 class Anchor:
     """A point of a link: Pinocchio's joint that carries it, and its placement in its frame."""
@@ -83,11 +86,21 @@ class Anchor:
 
 def on_feet(robot: Robot, point: np.ndarray) -> list[Anchor]:
     """A ``point`` (3,) of the foot links' frames [m], of the left and of the right foot."""
-    frames = [
-        robot.model.frames[robot.model.getFrameId(name, pin.BODY)] for name in robot.foot.frames
-    ]
-    move = pin.SE3(np.eye(3), np.array(point, float))
-    return [Anchor(frame.parentJoint, frame.placement * move) for frame in frames]
+    model = robot.model
+    frames = [model.frames[model.getFrameId(name, pin.BODY)] for name in robot.foot.frames]
+    return [Anchor(frame.parentJoint, frame.placement * shifted(point)) for frame in frames]
+
+
+def posed(model: pin.Model, q: np.ndarray | None = None) -> pin.Data:
+    """New data of a model at ``q`` (nq,), or with all joints at 0: places of joints and frames,
+    Jacobians ``J`` (6, nv) in the world's axes, mass and centre of all that each joint carries.
+    """
+    data = model.createData()
+    q = pin.neutral(model) if q is None else q
+    pin.centerOfMass(model, data, q)
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    return data
 
 
 @dataclass(frozen=True, eq=False)

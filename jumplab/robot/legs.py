@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from jumplab.robot.contact import Anchor, on_feet
+from jumplab.robot.contact import Anchor, on_feet, posed
 from jumplab.robot.files import LEG
 from jumplab.robot.stance import stance_configuration
 
@@ -86,8 +86,7 @@ def size(robot: Robot) -> Size:
 
 def segments_m(robot: Robot) -> tuple[float, float]:
     """Lengths of thigh and shank of the left leg, between its pitch axes [m]."""
-    data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, pin.neutral(robot.model))
+    data = posed(robot.model)
     joints = [robot.model.getJointId(robot.joints[role][0]) for role in LEG]
     places = np.array([data.oMi[joint].translation[[0, 2]] for joint in joints])
     thigh, shank = np.linalg.norm(np.diff(places, axis=0), axis=1)
@@ -103,9 +102,8 @@ def leg_columns(robot: Robot) -> list[np.ndarray]:
     from scipy.linalg import qr  # slow to import
 
     model = robot.model
-    data = model.createData()
+    data = posed(model, stance_configuration(robot))
     feet = [anchor.joint for anchor in on_feet(robot, np.zeros(3))]
-    pin.computeJointJacobians(model, data, stance_configuration(robot))
     out = []
     for foot, other in zip(feet, feet[::-1], strict=True):
         chain = sorted(set(model.supports[foot]) - set(model.supports[other]))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
+from jumplab.robot.contact import posed
 from jumplab.robot.files import entry, numbers, read_toml
 
 if TYPE_CHECKING:  # a robot is asked for these
@@ -59,14 +60,13 @@ def locked_joints(robot: Robot) -> tuple[LockedJoint, ...]:
     q = pin.neutral(model)
     for name, angle in numbers(config, "published", "held").items():
         q[model.idx_qs[_index(robot, model, name)]] = angle
-    data = model.createData()
-    pin.computeJointJacobians(model, data, q)
+    data = posed(model, q)
     at = model.getFrameId(trunk, pin.FrameType.BODY)
     if at == model.nframes:
         raise robot.error(f"[published] lacks the link {trunk!r}")
     carrier = model.frames[at].parentJoint
     placement = pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
-    to_base = placement * pin.updateFramePlacement(model, data, at).inverse()
+    to_base = placement * data.oMf[at].inverse()
     return tuple(_locked(robot, model, data, carrier, to_base))
 
 
@@ -81,8 +81,7 @@ def _locked(
 ) -> list[LockedJoint]:
     """Those of a model whose body ``carrier`` is the base's; ``to_base`` takes the world there."""
     reduced = robot.model
-    below = reduced.createData()
-    pin.computeSubtreeMasses(reduced, below)
+    below = posed(reduced)
     moving = {_index(robot, model, name) for name in robot.joint_names}
     edges = {j: {j, model.parents[j]} for j in range(BASE + 1, model.njoints)}
     stiff = {j: ends for j, ends in edges.items() if j not in moving}

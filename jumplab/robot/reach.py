@@ -8,6 +8,7 @@ envelopes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -79,6 +80,7 @@ def postures(
     from scipy.stats import qmc  # its import takes longer than what it does here
 
     m = robot.sagittal
+    metres = partial(size(robot).of, unit="m")
     (low, high) = TRUNK_RAD
     unit = qmc.Sobol(5, scramble=False).random(count)
     foot = unit[:, 0] * heel_up_rad
@@ -92,15 +94,14 @@ def postures(
     shoulder = shoulder[ok]
     com, rho = _com_inertia(m, angles)
     x, z = com.T
-    low, high = (size(robot).of(end, "m") for end in com_x_m)
-    ok = (z > size(robot).of(LOWEST_COM_M, "m")) & (x > low) & (x < high)
+    low, high = map(metres, com_x_m)
+    ok = (z > metres(LOWEST_COM_M)) & (x > low) & (x < high)
     columns = {"angles": angles, "com": com, "shoulder": shoulder, "rho": rho}
     inside = {name: x[ok] for name, x in columns.items()}
     if strength:
-        least_m = size(robot).of(LEAST_LEVER_M, "m")
-        shares = _force_shares(m, inside["angles"], inside["com"], least_m)
-        inside["force"] = 1 / shares.max(axis=0)
-        inside["speed"] = 1 / _speed_shares(m, inside["angles"], inside["com"]).max(axis=0)
+        at = (m, inside["angles"], inside["com"])
+        inside["force"] = 1 / _force_shares(*at, metres(LEAST_LEVER_M)).max(axis=0)
+        inside["speed"] = 1 / _speed_shares(*at).max(axis=0)
     return inside
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.robot.contact import posed
 from jumplab.robot.files import ROLES
 from jumplab.robot.motors import MotorLimits, read_only
 
@@ -144,10 +145,7 @@ def _axis_signs(model: pin.Model, data: pin.Data, role: str, pair) -> list[float
     """+1 if a joint turns its limb about +y in the neutral pose, -1 if about -y."""
     signs = []
     for name in pair:
-        joint = model.getJointId(name)
-        # (6, nv)
-        jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-        axis = jacobian[3:, model.idx_vs[joint]]
+        axis = data.J[3:, model.idx_vs[model.getJointId(name)]]
         if abs(axis[1]) < PITCH_AXIS:
             raise RobotError(
                 f"role {role}: joint {name!r} turns about {np.round(axis, 3)}, not about the "
@@ -201,18 +199,13 @@ def reduce(robot: Robot) -> SagittalModel:
     model = robot.model
     joints = robot.joints
     foot = robot.foot
-    data = model.createData()
-    q = pin.neutral(model)
-    pin.computeJointJacobians(model, data, q)
-    pin.framesForwardKinematics(model, data, q)
+    data = posed(model)
     below = {"ankle_pitch": 0, "knee": 1, "hip_pitch": 2, "shoulder_pitch": 4}  # rows of the links
     starts = {model.getJointId(n): i for role, i in below.items() for n in joints[role]}
-    link = [
-        next((starts[k] for k in supports[::-1] if k in starts), 3)
-        for supports in map(list, model.supports)
-    ]
+    link = [3] * model.njoints  # the trunk, where no role begins another one
     total = [pin.Inertia.Zero() for _ in SAGITTAL_LINKS]  # of arms that are held it stays so
     for j in range(1, model.njoints):
+        link[j] = starts.get(j, link[model.parents[j]])
         total[link[j]] += data.oMi[j].act(model.inertias[j])
     com = np.array([part.lever[[0, 2]] for part in total])
 
@@ -233,15 +226,13 @@ def reduce(robot: Robot) -> SagittalModel:
     span = np.array([ankle - toe, knee - ankle, hip - knee, shoulder - hip, hand])
     signs = np.ones((4, 2))
     rows = [HELD_ARM] * 4
-    for i, pair in enumerate(joints[role] for role in ROLES):
-        if pair:
-            signs[i] = _axis_signs(model, data, ROLES[i], pair)
+    for i, role in enumerate(ROLES):
+        if pair := joints[role]:
+            signs[i] = _axis_signs(model, data, role, pair)
             of = robot.limits[[robot.joint_names.index(name) for name in pair]]
             rows[i] = _both(of, pair, signs[i])
-    points = {
-        name: (link, np.zeros(2))
-        for name, link in (("toe", 0), ("knee", 2), ("hip", 3), ("shoulder", 4))
-    }
+    lower_ends = {"toe": 0, "knee": 2, "hip": 3, "shoulder": 4}
+    points = {name: (link, np.zeros(2)) for name, link in lower_ends.items()}
     points |= {"heel": (0, heel - toe), "hand": (4, hand), "mid-arm": (4, hand / 2)}
     return SagittalModel(
         mass=[part.mass for part in total],

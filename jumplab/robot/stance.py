@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot.contact import on_feet
+from jumplab.robot.contact import on_feet, posed
 from jumplab.robot.files import LEG
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, TO_COMPLEX, in_xz
 
@@ -156,10 +156,8 @@ def stance_configuration(robot: Robot) -> np.ndarray:
 
 def leg_length(robot: Robot) -> float:
     """Height of the hip's pitch axis above the sole as the robot stands [m]."""
-    model = robot.model
-    data = model.createData()
-    pin.forwardKinematics(model, data, stance_configuration(robot))
-    hip = data.oMi[model.getJointId(robot.joints["hip_pitch"][0])]
+    data = posed(robot.model, stance_configuration(robot))
+    hip = data.oMi[robot.model.getJointId(robot.joints["hip_pitch"][0])]
     foot, _ = on_feet(robot, robot.foot.center)
     return float(hip.translation[2] - foot.place(data).translation[2])
 
@@ -177,14 +175,13 @@ def knees(robot: Robot) -> list[tuple[int, float, float]]:
             (robot.joint_names.index(n), s, 0.0) for n, row, s in robot.role_signs() if row == 1
         ]
     model = robot.model
-    data = model.createData()
-    jacobian = pin.computeJointJacobians(model, data, pin.neutral(model))
+    data = posed(model)
     out = []
     for legs in zip(*(robot.joints[role] for role in LEG), strict=True):
         hip, knee, ankle = (data.oMi[model.getJointId(name)].translation for name in legs)
         column = model.idx_vs[model.getJointId(legs[1])]
-        sign = 1.0 if jacobian[4, column] > 0 else -1.0
-        axis = sign * jacobian[3:, column]
+        sign = 1.0 if data.J[4, column] > 0 else -1.0
+        axis = sign * data.J[3:, column]
         thigh = knee - hip
         shank = ankle - knee
         straight = thigh @ shank - (axis @ thigh) * (axis @ shank)
@@ -273,9 +270,8 @@ def holding(robot: Robot, q: np.ndarray, friction: float) -> tuple[float, str, f
     from scipy.optimize import linprog  # slow to import
 
     model = robot.model
-    data = model.createData()
+    data = posed(model, q)
     weight = pin.computeGeneralizedGravity(model, data, q)
-    pin.computeJointJacobians(model, data, q)
     level = friction / np.sqrt(2)
     edges = np.array([[x, y, 1.0] for x in (-level, level) for y in (-level, level)])
     anchors = [on_feet(robot, corner)[side] for side in (0, 1) for corner in robot.foot.corners]

@@ -8,7 +8,8 @@ file can be listed; :func:`read_tree` raises on the first.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree as ET
@@ -53,6 +54,7 @@ MOTOR_LIMITS = {
     "effort": ("N m", MOST_NM, "a placeholder", "peak torque"),
     "velocity": ("rad/s", MOST_RAD_S, "deg/s or a placeholder", "speed limit in rad/s"),
 }
+CYCLE = ": each robot needs one link without a parent"  # that has no root
 # why a joint of an MJCF has none
 IN_MJCF = {
     "lower": "has no range",
@@ -84,25 +86,31 @@ def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[s
     ``repair`` may name "inertia" (tensors that no solid has) and "massless" (bodies without mass):
     these are no faults then.
     """
-    links = [(link, f"{where}: link {link.get('name')!r}") for link in root.findall("link")]
-    out = _structure_faults(root, where)
-    out = out or [sentence for link, at in links for sentence in _inertial_faults(link, at)]
-    if out:  # what follows reads what was refused
-        return out
-    tree = Tree(root, where, repair_inertia=True)
-    most = np.inf if "inertia" in repair else slight(root)
-    low, high = SIZES_M  # beyond them, the lengths are wrong, which is found below
-    longest = min(GYRATION_M, size) if low <= (size := length_of(tree)) <= high else GYRATION_M
-    out += [sentence for link, at in links for sentence in _tensor_faults(link, at, most, longest)]
-    if "massless" not in repair:
-        out += _massless_bodies(tree)
-    out += [sentence for link, at in links for sentence in _shape_faults(link, at)]
-    return out or list(_unit_faults(tree))
+    links = root.findall("link")
+    out = _structure_faults(links, root.findall("joint")) or _named(links, _inertial_faults)
+    if not out:  # what follows reads what is refused there
+        tree = Tree(root, where, repair_inertia=True)
+        most = np.inf if "inertia" in repair else slight(root)
+        low, high = SIZES_M  # beyond them, the lengths are wrong, which is found below
+        size = length_of(tree)
+        longest = min(GYRATION_M, size) if low <= size <= high else GYRATION_M
+        out = _named(links, partial(_tensor_faults, most=most, longest=longest))
+        out += _massless_bodies(tree) if "massless" not in repair else ()
+        out += _named(links, _shape_faults)
+        out = out or _unit_faults(tree)
+    return [f"{where}: {sentence}" for sentence in out]
+
+
+def _named(
+    elements: list[ET.Element], faults_of: Callable[[ET.Element], Iterable[str]]
+) -> list[str]:
+    """The faults of all elements, behind what they are called."""
+    return [f"{e.tag} {e.get('name')!r}: {fault}" for e in elements for fault in faults_of(e)]
 
 
 def notes(tree: Tree) -> Iterator[str]:
-    """Notes on a URDF without faults: leftovers that are ignored, and harmless defects that are
-    repaired.
+    """Notes on a URDF without faults: leftovers that are ignored, harmless defects that are
+    repaired, and what was found on the way.
     """
     for element in tree.xml:
         if "xacro" in element.tag:
@@ -135,6 +143,7 @@ def notes(tree: Tree) -> Iterator[str]:
     if still:
         yield f"{_joints(still, 'has', 'have')} no motor (effort = 0): held"
     yield from _losses(moving)
+    yield from dict.fromkeys(tree.notes)
 
 
 def _joints(names: list[str], one: str, many: str) -> str:
@@ -158,80 +167,73 @@ def _losses(moving: list[Joint]) -> Iterator[str]:
         yield f"the file has losses of the motors: {counts}"
 
 
-def _triples(element: ET.Element | None, at: str, *keys: str) -> Iterator[str]:
+def _triples(element: ET.Element | None, name: str, *keys: str) -> Iterator[str]:
     """Attributes that are there, but are not three numbers."""
     for key in keys if element is not None else ():
         text = element.get(key)
         if text is not None and numbers(text, 3) is None:
-            yield f"{at} {key} = {text!r} must be three finite numbers"
+            yield f"{name} {key} = {text!r} must be three finite numbers"
 
 
 # structure
 # --------------------------------------------------------------------------------------------------
-def _structure_faults(root: ET.Element, where: str) -> list[str]:
+def _structure_faults(links: list[ET.Element], joints: list[ET.Element]) -> list[str]:
     """Names, connections and joint types."""
-    links = root.findall("link")
-    joints = root.findall("joint")
     if not links:
-        return [f"{where}: has no <link>; a robot needs a trunk, legs and feet"]
+        return ["has no <link>; a robot needs a trunk, legs and feet"]
     if not joints:
-        return [f"{where}: has {len(links)} links and no <joint>; nothing can move"]
+        return [f"has {len(links)} links and no <joint>; nothing can move"]
     if len(links) > MOST_LINKS:
-        return [
-            f"{where}: has {len(links)} links, a humanoid at most {MOST_LINKS}; give the file of "
-            f"one"
-        ]
+        return [f"has {len(links)} links, a humanoid at most {MOST_LINKS}; give the file of one"]
     doubtful = []
-    for kind, elements in (("link", links), ("joint", joints)):
-        for name, times in Counter(e.get("name") for e in elements).items():
-            if not name:
-                doubtful.append(f"{where}: {times} <{kind}> without a name; give each its own")
-            elif times > 1:
-                doubtful.append(f"{where}: {kind} {name!r} is defined {times} times; keep one")
+    for (kind, name), times in Counter((e.tag, e.get("name")) for e in links + joints).items():
+        if not name:
+            doubtful.append(f"{times} <{kind}> without a name; give each its own")
+        elif times > 1:
+            doubtful.append(f"{kind} {name!r} is defined {times} times; keep one")
     names = {link.get("name") for link in links}
-    wrong = [sentence for joint in joints for sentence in _joint_faults(joint, names, where)]
-    return doubtful + (wrong or list(_tree_faults(names, joints, where)))
+    wrong = _named(joints, partial(_joint_faults, links=names)) or _named(joints, _mimic_faults)
+    return doubtful + (wrong or list(_tree_faults(names, joints)))
 
 
-def _joint_faults(joint: ET.Element, links: set, where: str) -> Iterator[str]:
-    at = f"{where}: joint {joint.get('name')!r}"
+def _joint_faults(joint: ET.Element, links: set) -> Iterator[str]:
     kind = joint.get("type")
     ends = []
     for end in ("parent", "child"):
         element = joint.find(end)
         link = None if element is None else element.get("link")
         if not link:
-            yield f"{at}: has no {end} link; add <{end} link=...>"
+            yield f"has no {end} link; add <{end} link=...>"
         elif link not in links:
-            yield f"{at}: its {end} link {link!r} does not exist; correct the name"
+            yield f"its {end} link {link!r} does not exist; correct the name"
         ends.append(link)
     if ends[0] and ends[0] == ends[1]:
-        yield f"{at}: joins the link {ends[0]!r} to itself; correct parent or child"
+        yield f"joins the link {ends[0]!r} to itself; correct parent or child"
     if kind not in TYPES:
-        yield f"{at}: type {kind!r} is unknown; URDF has {', '.join(TYPES)}"
+        yield f"type {kind!r} is unknown; URDF has {', '.join(TYPES)}"
     origin = joint.find("origin")
-    yield from _triples(origin, f"{at}: origin", "xyz", "rpy")
+    yield from _triples(origin, "origin", "xyz", "rpy")
     turn = None if origin is None else numbers(origin.get("rpy"), 3)
     if turn is not None and np.abs(turn).max() > MOST_TURN_RAD:
-        yield f"{at}: origin rpy = {origin.get('rpy')!r} is beyond a turn: degrees? give rad"
+        yield f"origin rpy = {origin.get('rpy')!r} is beyond a turn: degrees? give rad"
     axis = joint.find("axis")
     if kind in MOVING and axis is not None:
-        direction = numbers(axis.get("xyz"), 3)
+        text = axis.get("xyz")
+        direction = numbers(text, 3)
         if direction is None:
-            yield f"{at}: axis xyz = {axis.get('xyz')!r} must be three finite numbers"
+            yield f"axis xyz = {text!r} must be three finite numbers"
         elif np.linalg.norm(direction) < 1e-6:
-            yield f"{at}: axis xyz = {axis.get('xyz')!r} has no direction; give a unit vector"
+            yield f"axis xyz = {text!r} has no direction; give a unit vector"
 
 
-def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[str]:
-    for joint in joints:
-        mimic = joint.find("mimic")
-        at = f"{where}: joint {joint.get('name')!r}"
-        if mimic is None:
-            continue
-        for key in ("multiplier", "offset"):
-            if numbers(mimic.get(key, "0"), 1) is None:
-                yield f"{at}: mimic {key} = {mimic.get(key)!r} must be a finite number"
+def _mimic_faults(joint: ET.Element) -> Iterator[str]:
+    mimic = joint.find("mimic")
+    for key in ("multiplier", "offset") if mimic is not None else ():
+        if numbers(mimic.get(key, "0"), 1) is None:
+            yield f"mimic {key} = {mimic.get(key)!r} must be a finite number"
+
+
+def _tree_faults(names: set, joints: list[ET.Element]) -> Iterator[str]:
     above = {}  # child -> its joints and their parents
     for joint in joints:
         child, parent = (joint.find(end).get("link") for end in ("child", "parent"))
@@ -239,14 +241,14 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
     for link, hanging in above.items():
         if len(hanging) > 1:
             yield (
-                f"{where}: link {link!r} hangs on {len(hanging)} joints "
+                f"link {link!r} hangs on {len(hanging)} joints "
                 f"({listed(hanging)}): a closed loop; cut it to leave a tree"
             )
             return
     roots = sorted(names - set(above))
     if len(roots) > 1:
         yield (
-            f"{where}: {len(roots)} links have no parent ({listed(roots)}), Pinocchio "
+            f"{len(roots)} links have no parent ({listed(roots)}), Pinocchio "
             f"keeps one tree and drops the rest; connect them"
         )
         return
@@ -254,40 +256,34 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
     for link in below:
         below += [child for child, hanging in above.items() if link in hanging.values()]
     if lost := listed(sorted(names - set(below))):
-        end = ": each robot needs one link without a parent"
-        if roots:
-            end = f" apart from the root {roots[0]!r}"
-        yield f"{where}: the links {lost} form a cycle{end}"
+        end = f" apart from the root {roots[0]!r}" if roots else CYCLE
+        yield f"the links {lost} form a cycle{end}"
 
 
 # inertials
 # --------------------------------------------------------------------------------------------------
-def _inertial_faults(link: ET.Element, at: str) -> Iterator[str]:
+def _inertial_faults(link: ET.Element) -> Iterator[str]:
     inertial = link.find("inertial")
-    mass = link.find("inertial/mass")
-    tensor = link.find("inertial/inertia")
     if inertial is None:
         return
+    mass = inertial.find("mass")
+    tensor = inertial.find("inertia")
     if mass is None:
-        yield f"{at}: <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"
-        return
-    value = numbers(mass.get("value"), 1)
-    if value is None:
-        yield f"{at}: mass = {mass.get('value')!r} must be a finite number of kg"
-        return
-    if value[0] < 0:
-        yield f"{at}: mass = {value[0]:g} kg must not be negative; correct <mass>"
-        return
-    yield from _triples(inertial.find("origin"), f"{at}: inertial origin", "xyz", "rpy")
-    if tensor is None:
-        yield f"{at}: <inertial> has no <inertia>; add the six numbers in kg m^2"
-        return
-    wrong = next((key for key in MOMENTS if numbers(tensor.get(key), 1) is None), None)
-    if wrong:
-        yield f"{at}: {wrong} = {tensor.get(wrong)!r} must be a finite number of kg m^2"
+        yield "<inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"
+    elif (value := numbers(mass.get("value"), 1)) is None:
+        yield f"mass = {mass.get('value')!r} must be a finite number of kg"
+    elif value[0] < 0:
+        yield f"mass = {value[0]:g} kg must not be negative; correct <mass>"
+    else:
+        yield from _triples(inertial.find("origin"), "inertial origin", "xyz", "rpy")
+        if tensor is None:
+            yield "<inertial> has no <inertia>; add the six numbers in kg m^2"
+        elif wrong := [key for key in MOMENTS if numbers(tensor.get(key), 1) is None]:
+            text = tensor.get(wrong[0])
+            yield f"{wrong[0]} = {text!r} must be a finite number of kg m^2"
 
 
-def _tensor_faults(link: ET.Element, at: str, most: float, longest: float) -> Iterator[str]:
+def _tensor_faults(link: ET.Element, most: float, longest: float) -> Iterator[str]:
     """Of an inertia farther than ``most`` [kg m^2] from a solid's, or too large: with a radius of
     gyration above ``longest`` [m], which no repair mends.
     """
@@ -303,15 +299,15 @@ def _tensor_faults(link: ET.Element, at: str, most: float, longest: float) -> It
     )
     gyration = np.sqrt(abs(high) / mass)
     if low <= 0 and gap > most:
-        yield f"{at}: principal moment of inertia {low:.3g} kg m^2 must be positive; {remedy}"
+        yield f"principal moment of inertia {low:.3g} kg m^2 must be positive; {remedy}"
     elif gap > most:
         yield (
-            f"{at}: principal moments {low:.3g}, {middle:.3g}, {high:.3g} kg m^2: the largest must "
+            f"principal moments {low:.3g}, {middle:.3g}, {high:.3g} kg m^2: the largest must "
             f"not exceed the sum of the others, no solid has this; {remedy}"
         )
     elif gyration > longest:
         yield (
-            f"{at}: moment of inertia {high:.3g} kg m^2 on {mass:g} kg is a radius of gyration of "
+            f"moment of inertia {high:.3g} kg m^2 on {mass:g} kg is a radius of gyration of "
             f"{gyration:.3g} m, at most {longest:.3g} is likely; is it in g mm^2 or kg cm^2?"
         )
 
@@ -322,20 +318,18 @@ def _massless_bodies(tree: Tree) -> Iterator[str]:
     """
     remedy = 'or let it have a gram: --repair massless, or [source] repair = ["massless"]'
     for joint in tree.joints.values():
-        link = joint.child
-        at = f"{tree.where}: link {link!r}"
-        weighs = tree.body_of(link).mass > 0 or tree.elements[link].get("between")
-        if joint.kind == "fixed" or weighs or not tree.carried(link):
-            continue
-        if np.isclose(tree.carried(link), tree.mass):
+        link = tree.elements[joint.child]
+        carried = tree.carried(joint.child)
+        weighs = tree.body_of(joint.child).mass > 0 or link.get("between")
+        if joint.kind == "fixed" or weighs or not carried or np.isclose(carried, tree.mass):
             continue
         fault = f"mass = 0 kg, the body of joint {joint.name!r} must weigh more than 0 kg"
-        if tree.elements[link].find("inertial") is None:
+        if link.find("inertial") is None:
             fault = (
                 f"has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, PyBullet "
                 f"1 kg; joint {joint.name!r} needs a body of more than 0 kg"
             )
-        yield f"{at}: {fault}, {remedy}"
+        yield f"link {joint.child!r}: {fault}, {remedy}"
 
 
 # units and shapes
@@ -360,21 +354,18 @@ def _unit_faults(tree: Tree) -> Iterator[str]:
         ),
     ):
         if not low <= value <= high:
-            guess = many if value > high else few
-            yield f"{tree.where}: {sentence.format(value, low, high, guess)}"
-    turns = [np.ptp(x) for x in _ranges(tree)]
-    if tree.format == "MJCF" and 0 < max(turns, default=0.0) < DEGREES_RAD:
+            yield sentence.format(value, low, high, many if value > high else few)
+    turns = [
+        joint.limits["upper"] - joint.limits["lower"]
+        for joint in tree.joints.values()
+        if joint.kind == "revolute" and {"lower", "upper"} <= set(joint.limits)
+    ]
+    widest = max(map(abs, turns), default=0.0)
+    if tree.format == "MJCF" and 0 < widest < DEGREES_RAD:
         yield (
-            f"{tree.where}: the widest range of a joint is {max(turns):.2g} rad; an MJCF has its "
+            f"the widest range of a joint is {widest:.2g} rad; an MJCF has its "
             f'angles in degrees: if these are in rad, add <compiler angle="radian"/>'
         )
-
-
-def _ranges(tree: Tree) -> Iterator[tuple[float, float]]:
-    """Lower and upper stops of the hinges that have both [rad]."""
-    for joint in tree.joints.values():
-        if joint.kind == "revolute" and {"lower", "upper"} <= set(joint.limits):
-            yield joint.limits["lower"], joint.limits["upper"]
 
 
 def length_of(tree: Tree) -> float:
@@ -383,21 +374,21 @@ def length_of(tree: Tree) -> float:
     return max(sum(np.linalg.norm(j.place.translation) for j in chain) for chain in chains)
 
 
-def _shape_faults(link: ET.Element, at: str) -> Iterator[str]:
+def _shape_faults(link: ET.Element) -> Iterator[str]:
     """Sizes that no shape has, places that are no numbers, meshes without a file."""
     for origin in link.findall("collision/origin"):
-        yield from _triples(origin, f"{at}: collision origin", "xyz", "rpy")
+        yield from _triples(origin, "collision origin", "xyz", "rpy")
     for shape in link.findall("collision/geometry/*"):
         for key, count in SIZES.get(shape.tag, {}).items():
             values = numbers(shape.get(key), count)
             least = 0.0 if shape.tag == "sphere" else np.nextafter(0.0, 1.0)
             if values is None or min(values) < least:
                 wanted = "three positive numbers" if count == 3 else "a positive number"
-                yield f"{at}: {shape.tag} {key} = {shape.get(key)!r} must be {wanted} of m"
+                yield f"{shape.tag} {key} = {shape.get(key)!r} must be {wanted} of m"
         if shape.tag == "mesh" and not shape.get("vertex"):
             if not shape.get("filename"):
-                yield f"{at}: a collision mesh has no filename; add it, or remove the shape"
-            yield from _triples(shape, f"{at}: mesh", "scale")
+                yield "a collision mesh has no filename; add it, or remove the shape"
+            yield from _triples(shape, "mesh", "scale")
 
 
 # limits
@@ -411,49 +402,40 @@ def limit_faults(
     that can hold them.
     """
     if wrong := wrong_limits(tree, joint, given):
-        keys = ", ".join(keys_of(wrong))
         link = ";" if tree.format == "MJCF" else ", or"
+        keys = ", ".join(sorted(wrong, key=LIMITS.index))
         advice = f"{link} give {keys} in [{table}] of the configuration" if table else ""
-        yield f"{tree.where}: joint {joint!r}: {'; '.join(wrong.values())}{advice}"
-
-
-def keys_of(wrong: dict[tuple[str, ...], str]) -> list[str]:
-    """The limits that complaints are about, in the order of :data:`LIMITS`."""
-    return [key for key in LIMITS if any(key in group for group in wrong)]
+        sentences = "; ".join(dict.fromkeys(wrong.values()))
+        yield f"{tree.where}: joint {joint!r}: {sentences}{advice}"
 
 
 def wrong_limits(
     tree: Tree, joint: str, given: Mapping[str, float] = MappingProxyType({})
-) -> dict[tuple[str, ...], str]:
-    """Limits of a joint that cannot be meant, or are missing, and what is wrong with them.
+) -> dict[str, str]:
+    """Limits of a joint that cannot be meant, or are missing, and what is wrong with each.
 
     ``given`` values [rad, N m, rad/s] go before those of the file.
     """
     limit = tree.joints[joint].element.find("limit")
     texts = {} if limit is None else limit.attrib
     values = tree.joints[joint].limits | given
-    absent = tuple(key for key in LIMITS if key not in values and key not in texts)
-    wrong = {}
-    if absent and tree.format == "MJCF":
-        wrong[absent] = "; ".join(dict.fromkeys(IN_MJCF[key] for key in absent))
-    elif absent and limit is None:
-        wrong[absent] = f"has no <limit>; add {', '.join(absent)}"
-    elif absent:
-        them = "it" if len(absent) == 1 else "them"
-        wrong[absent] = (
-            f"<limit> has no {', '.join(absent)}, which Pinocchio reads as 0; add {them}"
-        )
+    absent = [key for key in LIMITS if key not in values and key not in texts]
+    names = ", ".join(absent)
+    them = "it" if len(absent) == 1 else "them"
+    lacking = f"<limit> has no {names}, which Pinocchio reads as 0; add {them}"
+    if limit is None:
+        lacking = f"has no <limit>; add {names}"
+    wrong = {key: IN_MJCF[key] if tree.format == "MJCF" else lacking for key in absent}
     for key in LIMITS:
         if key not in values and key in texts:
-            wrong[key,] = f"{key} = {texts[key]!r} must be a finite number"
+            wrong[key] = f"{key} = {texts[key]!r} must be a finite number"
     if sentence := {"lower", "upper"} <= set(values) and _range_fault(**values):
-        wrong["lower", "upper"] = sentence
+        wrong |= {"lower": sentence, "upper": sentence}
     for key, (unit, most, what, remedy) in MOTOR_LIMITS.items():
         value = values.get(key, 1.0)
-        if value <= 0:
-            wrong[key,] = f"{key} = {value:g} {unit} must be positive; give the {remedy}"
-        elif value > most:
-            wrong[key,] = f"{key} = {value:g} {unit} is above {most:g}: {what}; give the {remedy}"
+        fault = "must be positive" if value <= 0 else f"is above {most:g}: {what}"
+        if not 0 < value <= most:
+            wrong[key] = f"{key} = {value:g} {unit} {fault}; give the {remedy}"
     return wrong
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import pinocchio as pin
-
 from jumplab.errors import RobotError, quoted
+from jumplab.robot.contact import posed
 from jumplab.robot.description import Robot
 from jumplab.robot.files import files_of, read_toml, roles_table
 from jumplab.robot.stance import check_stance, stance_configuration
@@ -50,14 +49,14 @@ class Checkup:
         r = self.robot
         moving = len(r.joint_names)
         foot = r.foot
-        com = pin.centerOfMass(r.model, r.model.createData(), stance_configuration(r))
+        data = posed(r.model, stance_configuration(r))
         movable = sum(joint.kind in MOVING for joint in self.tree.joints.values())
         return [
             f"robot {r.name}: {r.total_mass:.3f} kg ({self.tree.mass:.3f} kg in the XML), "
             f"{moving} of {movable} joints move, {len(self.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
             f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
-            f"standing: CoM {com[2]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "
+            f"standing: CoM {data.com[0][2]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "
             f"trunk {r.stance['trunk_pitch_rad']:.2f} rad",
             "five links describe it"
             if r.planar

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.robot_import.checks import MOST_RAD
-from jumplab.robot_import.urdf import Joint, Tree, numbers, placed
+from jumplab.robot_import.urdf import Joint, Tree, across, numbers, placed
 from jumplab.robot_import.write import listed
 
 # None of these numbers is printed by the paper.
@@ -54,7 +54,8 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip
     to ankle, a sole is guessed if the link ``foot`` has no shape.
     """
-    touching, around, kinds = sole_points(tree, foot, turn, thickness(leg_m))
+    thick = thickness(leg_m)
+    touching, around, kinds = sole_points(tree, foot, turn, thick)
     if not kinds:
         x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
         files = [shape.get("filename") for x in tree.below(foot) for _, shape in tree.shapes(x)]
@@ -68,41 +69,46 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     if np.ptp(touching[:, 0]) < least:
         level = _level(tree, foot, turn, leg_m)
         turn = pin.rpy.rpyToMatrix(0.0, level, 0.0) @ turn
-        touching, around, _ = sole_points(tree, foot, turn, thickness(leg_m))
-    if max(np.ptp(touching[:, :2], axis=0)) < least:
+        touching, around, _ = sole_points(tree, foot, turn, thick)
+    long = np.ptp(touching[:, :2], axis=0)
+    if max(long) < least:
         wide = 1e3 * max(np.ptp(around[:, :2], axis=0))
         raise tree.error(
             f"the foot {foot!r} touches the ground in a point ({source}, {wide:.0f} mm wide): it "
             f"has no sole, and jumps are planned for feet that stand flat; give the foot a shape "
             f"with a level lower side"
         )
-    long = max(np.ptp(touching[:, :2], axis=0))
-    if long > LONGEST * leg_m:
+    if max(long) > LONGEST * leg_m:
         raise tree.error(
-            f"the sole of the foot {foot!r} measures {long:.3g} m ({source}), the leg {leg_m:.3g} "
-            f'm; are its shapes in millimetres? give a mesh scale = "0.001 0.001 0.001", or '
-            f"divide their sizes by 1000"
+            f"the sole of the foot {foot!r} measures {max(long):.3g} m ({source}), the leg "
+            f"{leg_m:.3g} m; are its shapes in millimetres? give a mesh scale = "
+            f'"0.001 0.001 0.001", or divide their sizes by 1000'
         )
     ends = []
     for axis in range(2):
-        points = touching if np.ptp(touching[:, axis]) >= least else around
-        ends.append((float(points[:, axis].min()), float(points[:, axis].max())))
-        source += ", whose round side counts as level" if points is around else ""
+        even = long[axis] >= least
+        along = (touching if even else around)[:, axis]
+        ends.append((float(along.min()), float(along.max())))
+        source += "" if even else ", whose round side counts as level"
     return Sole(*ends, float(touching[:, 2].min()), source, level)
 
 
 def _level(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> float:
     """Pitch [rad] at which a foot stands on most of its length; 0 if none helps much."""
     _, points, _ = sole_points(tree, foot, turn, np.inf)
-    lengths = {}  # angle -> length that touches [m]
-    for angle in sorted(np.arange(-LEANS_RAD, LEANS_RAD, STEP_RAD), key=abs):
-        turned = points @ pin.rpy.rpyToMatrix(0.0, angle, 0.0).T
-        low = turned[:, 2] < turned[:, 2].min() + thickness(leg_m)
-        lengths[angle] = np.ptp(turned[low, 0])
-    best = max(lengths, key=lengths.get)
-    if lengths[best] <= 3 * SMALLEST * leg_m:
+
+    def pitched(angle: float) -> np.ndarray:
+        return points @ pin.rpy.rpyToMatrix(0.0, angle, 0.0).T
+
+    def length(angle: float) -> float:  # that touches [m]
+        x, _, z = pitched(angle).T
+        return np.ptp(x[z < z.min() + thickness(leg_m)])
+
+    # the first of the best, from the middle outwards
+    best = max(sorted(np.arange(-LEANS_RAD, LEANS_RAD, STEP_RAD), key=abs), key=length)
+    if length(best) <= 3 * SMALLEST * leg_m:
         return 0.0
-    turned = points @ pin.rpy.rpyToMatrix(0.0, best, 0.0).T
+    turned = pitched(best)
     ahead = turned[:, 0] > turned[:, 0].min() + np.ptp(turned[:, 0]) / 2
     heel, toe = (half[np.argmin(half[:, 2])] for half in (turned[~ahead], turned[ahead]))
     return float(best + np.arctan2(toe[2] - heel[2], toe[0] - heel[0]))
@@ -134,10 +140,9 @@ def sole_points(
                     around.append(placed(at, corners))
                     touching.append(_lowest(shape, corners, at))
                     kinds.add(shape.tag)
-    ends = np.concatenate(touching)
-    level = ends[:, 2].min(initial=np.inf) + thick_m
-    low = [points[points[:, 2] < level] for points in (ends, np.concatenate(around))]
-    return *low, kinds
+    touching, around = map(np.concatenate, (touching, around))
+    level = touching[:, 2].min(initial=np.inf) + thick_m
+    return touching[touching[:, 2] < level], around[around[:, 2] < level], kinds
 
 
 def _lowest(shape: ET.Element, corners: np.ndarray, place: pin.SE3) -> np.ndarray:
@@ -151,7 +156,7 @@ def _lowest(shape: ET.Element, corners: np.ndarray, place: pin.SE3) -> np.ndarra
     along = place.rotation[:, 2]
     down = np.array([0.0, 0.0, -1.0])
     if shape.tag == "cylinder":
-        down = down - (down @ along) * along
+        down = across(down, along)
         if np.linalg.norm(down) < STANDS:
             return placed(place, corners)
         down = down / np.linalg.norm(down)
@@ -165,9 +170,9 @@ def refuse_wheel(tree: Tree, ankle: Joint) -> None:
     if ankle.kind != "continuous" and np.abs(stops).max() <= MOST_RAD:
         return
     for part in tree.bodies[tree.carrier[ankle.child]]:
+        to_joint = tree.pose[ankle.child].actInv(tree.pose[part])
         for place, shape in tree.shapes(part) + tree.shapes(part, "visual"):
-            to_joint = tree.pose[ankle.child].inverse() * tree.pose[part] * place
-            if _round(tree, shape, to_joint, ankle.axis):
+            if _round(tree, shape, to_joint * place, ankle.axis):
                 raise tree.error(
                     f"the legs end in wheels: joint {ankle.name!r} turns without stops, and its "
                     f"body {part!r} is round about it; jumps are planned for feet with soles"

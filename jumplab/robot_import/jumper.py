@@ -20,9 +20,9 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.forms import filled
+from jumplab.robot.contact import shifted
 from jumplab.robot.description import Robot
 from jumplab.robot.files import (
-    LEG,
     STANCE,
     TABLES,
     check_entries,
@@ -32,15 +32,9 @@ from jumplab.robot.files import (
     table,
 )
 from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, SAME, Body, Lumped, RoleJoints, lump
-from jumplab.robot_import.roles import AXES
+from jumplab.robot_import.roles import AXES, opposite
 from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
-from jumplab.robot_import.write import (
-    HERE,
-    add_boxes,
-    add_joint,
-    add_link,
-    shifted,
-)
+from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin
 
 # None of these numbers is printed by the paper. Boxes have the default robot's proportions, as
 # shares of the leg's length from hip to ankle: the trunk's rear, front, half width, bottom and top,
@@ -82,8 +76,12 @@ def make_jumper(tree: Tree, config: dict) -> tuple[Robot, Lumped]:
             f"robot configuration: 'name' = {name!r} must be a plain file name: pictures and files "
             f"of the robot are called so"
         )
-    config = _facing(config)
     source = source_of(config)
+    forward = source["forward"]
+    facing = entry(config, "source", "facing", kind=str, default="") or forward
+    if facing != forward:
+        config = _turned(config, forward, facing)
+        source["forward"] = facing
     roles = roles_table(config)
     feet = tuple(entry(config, "feet", "links", kind=str, count=2))
     lumped = lump(tree, config, roles, source, feet)
@@ -114,29 +112,24 @@ def source_of(config: dict) -> dict:
         )
     repair = table(config, "source").get("repair", [])
     out["repair"] = repair if isinstance(repair, list) else [repair]
-    if wrong := [word for word in out["repair"] if word not in REPAIRS]:
-        raise RobotError(
-            f"robot configuration: 'source.repair' accepts {', '.join(REPAIRS)}, got {wrong[0]!r}"
-        )
+    for word in out["repair"]:
+        if word not in REPAIRS:
+            raise RobotError(
+                f"robot configuration: 'source.repair' accepts {', '.join(REPAIRS)}, got {word!r}"
+            )
     return out
 
 
-def _facing(config: dict) -> dict:
-    """The configuration of a robot that faces as [source] says: where that is opposite to what was
-    found, its pairs, soles and assumed ranges turned about.
+def _turned(config: dict, forward: str, facing: str) -> dict:
+    """The configuration of a robot that faces the other way than was found: its pairs, soles and
+    assumed ranges are turned about.
     """
-    facing = entry(config, "source", "facing", kind=str, default="")
-    forward = entry(config, "source", "forward", kind=str, default="+x")
-    if facing in ("", forward):
-        return config
-    other = forward.translate(str.maketrans("+-", "-+"))
-    if facing != other:
+    if facing != opposite(forward):
         raise RobotError(
-            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, the "
-            f"two directions in which it can walk"
+            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or "
+            f"{opposite(forward)}, the two directions in which it can walk"
         )
     new = copy.deepcopy(config)
-    new["source"]["forward"] = facing
     new["joints"] |= {role: list(pair[::-1]) for role, pair in roles_table(config).items()}
     feet = new["feet"]
     feet["links"] = entry(config, "feet", "links", kind=str, count=2)[::-1]
@@ -170,7 +163,7 @@ def _sole(tree: Tree, config: dict, offset: np.ndarray) -> dict[str, float]:
 def _cut_hips(lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> None:
     """Cut hip ranges to where boxes of thigh and trunk meet; canted hips keep theirs."""
     cut = 0.0
-    for leg in zip(*(lumped.moved_by(roles[role]) for role in LEG), strict=True):
+    for leg in lumped.legs(roles):
         hip, *_ = leg
         thigh, _ = _thigh_and_shank(lumped, *leg)
         trunk = _solids(lumped.trunk, boxes, hip, 0.0)
@@ -206,7 +199,7 @@ def _gap(one: list[tuple], other: list[tuple]) -> float:
 def _urdf(name: str, lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> str:
     robot = ET.Element("robot", name=name)
     trunk, *others = lumped.bodies.values()
-    hip = np.mean([body.place for body in lumped.moved_by(roles["hip_pitch"])], axis=0)
+    hip = np.mean([hip.place for hip, _, _ in lumped.legs(roles)], axis=0)
     _add_trunk(robot, trunk, boxes[trunk.name], hip - trunk.place)
     for body in others:
         _add_body(robot, body.name, body.inertia, boxes[body.name])
@@ -240,9 +233,8 @@ def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
             add_joint(robot, joint.name, kind, ends, model.jointPlacements[k], joint.axis, limits)
         todo += below
         boxed = next((part for part in tree.bodies[carrier] if part in boxes), None)
-        axes = (
-            lumped.placed[link].inverse() * shifted(lumped.bodies[boxed].place) if boxed else HERE
-        )
+        place = shifted(lumped.bodies[boxed].place) if boxed else HERE
+        axes = lumped.placed[link].inverse() * place
         _add_body(robot, link, model.inertias[carrier], boxes.get(boxed, []), axes=axes)
     ET.indent(robot)
     place = shifted(-trunk.place) * lumped.placed[root]
@@ -266,8 +258,11 @@ def _add_body(
 ) -> None:
     """A link with boxes that collide, and boxes only ``seen``, along ``axes`` in it."""
     link = add_link(robot, name, inertia)
-    add_boxes(link, "visual", [*boxes, *seen], axes)
-    add_boxes(link, "collision", boxes, axes)
+    for kind, shown in (("visual", [*boxes, *seen]), ("collision", boxes)):
+        for centre, size in shown:
+            shape = add(link, kind)
+            add_origin(shape, axes * shifted(centre))
+            add(add(shape, "geometry"), "box", size=size)
 
 
 def _add_trunk(robot: ET.Element, body: Body, boxes: Boxes, hip: np.ndarray) -> None:
@@ -308,7 +303,7 @@ def _boxes(
     config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float]
 ) -> dict[str, Boxes]:
     """Boxes of trunk, and of left and right thigh, shank, foot and arm, by the name of the body."""
-    legs = list(zip(*(lumped.moved_by(roles[role]) for role in LEG), strict=True))
+    legs = lumped.legs(roles)
     leg = float(np.linalg.norm((legs[0][0].place - legs[0][2].place)[[0, 2]]))
     width = {}
     for part, share in THICKNESS.items():
@@ -425,10 +420,10 @@ def _toml(
     motors = {}
     for key in MOTOR:
         limits = {b.joint: b.limits for b in lumped.bodies.values() if key in b.limits}
-        if key in RATIOS:  # speeds as shares of the speed limit
-            values = {joint: x[key] / x["velocity"] for joint, x in limits.items()}
-        else:
-            values = {joint: x[key] for joint, x in limits.items()}
+        # speeds as shares of the speed limit
+        values = {
+            joint: x[key] / (x["velocity"] if key in RATIOS else 1) for joint, x in limits.items()
+        }
         motors[RATIOS.get(key, key)] = values
     return filled(
         "robot_import/jumper.toml.in",

@@ -7,7 +7,7 @@ and directions of the moving joints are kept.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -15,14 +15,15 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.robot.contact import posed, shifted
 from jumplab.robot.files import LEG, entry, table
+from jumplab.robot.reduction import MIRROR
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.roles import leg_joints, robot_axes
 from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Joint, Tree, link_poses, links_of
-from jumplab.robot_import.write import key, listed, shifted
+from jumplab.robot_import.write import key, listed
 
 RoleJoints = dict[str, tuple[str, ...]]
-MIRROR = np.array([1.0, -1.0, 1.0])  # times a vector: its mirror image
 IMAGE = np.outer([1.0, -1.0, 1.0, 1.0], [1.0, -1.0, 1.0, 1.0])  # times a (4, 4) pseudo-inertia
 # as in the default robot; MuJoCo refuses zero
 DUMMY = pin.Inertia(1e-3, np.zeros(3), 1e-6 * np.eye(3))
@@ -81,10 +82,10 @@ class Lumped:
         """The body that carries all others."""
         return next(iter(self.bodies.values()))
 
-    def moved_by(self, joints: Iterable[str]) -> list[Body]:
-        """The bodies that joints (by name) move."""
+    def legs(self, roles: RoleJoints) -> list[list[Body]]:
+        """The bodies that hip, knee and ankle move, of the left and of the right leg."""
         of = {body.joint: body for body in self.bodies.values()}
-        return [of[joint] for joint in joints]
+        return [[of[roles[role][side]] for role in LEG] for side in range(2)]
 
     def place(self, link: str) -> pin.SE3:
         """Place of a link in the frame of its body [m]."""
@@ -169,7 +170,8 @@ def _levelled(tree: Tree, config: dict, roles: RoleJoints, model: pin.Model) -> 
     {} if they are 0 in the file.
     """
     pitch = entry(config, "feet", "level_rad", default=0.0)
-    axes = pin.computeJointJacobians(model, model.createData(), pin.neutral(model))[3:].T
+    data = posed(model)
+    axes = data.J[3:].T
     out = {}
     for name in roles["ankle_pitch"] if pitch else ():
         joint = model.getJointId(name)
@@ -375,8 +377,8 @@ def _bodies(
     The middle of the left sole is ``beside`` [m] the origin of its link, to the left; that of the
     right one is opposite.
     """
-    data = model.createData()
-    axes = pin.computeJointJacobians(model, data, pin.neutral(model))[3:].T
+    data = posed(model)
+    axes = data.J[3:].T
     carriers = {link: model.frames[i].parentJoint for link, i in links_of(model).items()}
     bodies = []
     names = {}

@@ -12,6 +12,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -28,9 +29,11 @@ from mujoco import mjtTrn as TRANSMISSION
 from mujoco import mjtWrap as WRAP
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed, shifted
+from jumplab.robot.contact import shifted
+from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed
 
 ON_JOINT = [*map(int, (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPARENT))]
+TURNING = [*map(int, (JOINT.mjJNT_HINGE, JOINT.mjJNT_BALL))]
 TIES = [*map(int, (EQUALITY.mjEQ_CONNECT, EQUALITY.mjEQ_WELD))]  # of bodies: closed chains
 # an activation of these is no larger than the control
 PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT))]
@@ -38,6 +41,7 @@ PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_F
 TURN, TILT = np.radians(np.meshgrid(np.arange(0, 360, 6), np.arange(-90, 91, 6))).reshape(2, -1)
 ROUND = np.stack([np.cos(TILT) * np.cos(TURN), np.cos(TILT) * np.sin(TURN), np.sin(TILT)], axis=-1)
 LONG = {GEOM.mjGEOM_CAPSULE: "capsule", GEOM.mjGEOM_CYLINDER: "cylinder"}
+UNREADABLE = (ValueError, mujoco.FatalError, OSError)
 MASSLESS = "; give the body an <inertial> with a mass above 0"
 UNNAMED = "MuJoCo Model"
 MOST_MESHES = 5  # of which hulls are made in half a second; MuJoCo lets nothing else run then
@@ -59,13 +63,8 @@ def as_description(path: Path, text: str) -> str:
     notes = []
     spec = _spec(path, text, notes)
     model = _compiled(spec, path, notes)
-    root = _robot_of(model, path.name, notes)
     xml = ET.Element("robot", name=_name(spec, path, text), format="MJCF")
-    writer = _Writer(model, root, xml, notes)
-    for body in writer.bodies:
-        writer.add_body(body)
-    writer.add_equalities()
-    writer.note_what_is_left_out()
+    _Writer(model, _robot_of(model, path.name, notes), xml, notes).write()
     for note in notes:
         add(xml, "note", text=note)
     return ET.tostring(xml, encoding="unicode")
@@ -90,21 +89,15 @@ def _spec(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
             spec = mujoco.MjSpec.from_string(text, include=included)
             spec.modelfiledir = f"{path.parent}/"
             return spec
-        except (ValueError, mujoco.FatalError, OSError) as e:
-            sentence = _sentence(e)
-            before = [text, *texts.values()]
-            after = before
-            if (match := UNKNOWN.search(sentence)) and match[2] in SETTINGS:
-                key, tag = match.groups()
-                given = re.compile(rf"(<{tag}\b[^>]*?)\s{key}\s*=\s*([\"']).*?\2", re.DOTALL)
-                after = [given.sub(r"\1", x) for x in before]
-            if after == before:
-                raise RobotError(
-                    f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
-                ) from e
-            text, *inner = after
-            texts = dict(zip(texts, inner, strict=True))
+        except UNREADABLE as e:
+            match = UNKNOWN.search(_sentence(e))
+            key, tag = match.groups() if match else ("", "")
+            given = re.compile(rf"(<{tag}\b[^>]*?)\s{key}\s*=\s*([\"']).*?\2", re.DOTALL)
+            if tag not in SETTINGS or not any(map(given.search, (text, *texts.values()))):
+                raise _unreadable(path, e) from e
             plain = False
+            text = given.sub(r"\1", text)
+            texts = {name: given.sub(r"\1", inner) for name, inner in texts.items()}
             notes.append(f"<{tag}> has {key!r}, which this MuJoCo does not know: left out")
 
 
@@ -128,6 +121,10 @@ def _sentence(e: Exception) -> str:
     """MuJoCo's complaint in a line, with the element that it names."""
     sentence = "; ".join(line.strip() for line in str(e).splitlines() if line.strip())
     return sentence + (MASSLESS if "mjMINVAL" in sentence else "")
+
+
+def _unreadable(path: Path, e: Exception) -> RobotError:
+    return RobotError(f"{path.name}: MuJoCo cannot read this MJCF file: {_sentence(e)}")
 
 
 def _name(spec: mujoco.MjSpec, path: Path, text: str) -> str:
@@ -164,12 +161,9 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
         try:
             return spec.compile()
         except (ValueError, mujoco.FatalError) as e:
-            sentence = _sentence(e)
-            lost = _lost(spec.meshes, sentence)
+            lost = _lost(spec.meshes, _sentence(e))
             if not lost:
-                raise RobotError(
-                    f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
-                ) from e
+                raise _unreadable(path, e) from e
             files = [mesh.file for mesh in lost]
             spec = unread
             _leave_out(spec, [m for m in spec.meshes if m.file in files], path, notes)
@@ -229,18 +223,20 @@ def _pairs_with_others(spec: mujoco.MjSpec, notes: list[str]) -> list[mujoco.Mjs
     are here are marked as such that touch.
     """
     here = {geom.name: geom for geom in spec.geoms}
-    by_geom = {}
+    pairs = []
+    others = {}  # in order, each once
     for pair in spec.pairs:
-        ends = pair.geomname1, pair.geomname2
+        ends = (pair.geomname1, pair.geomname2)
         if lost := [name for name in ends if name not in here]:
-            by_geom[lost[0]] = [*by_geom.get(lost[0], []), pair]
-            for name in {*ends} & {*here}:
+            pairs.append(pair)
+            others[lost[0]] = pair
+            for name in {*ends} - {*lost}:
                 here[name].contype = 1
-    if by_geom:
+    if pairs:
         notes.append(
-            f"the pairs with {listed(by_geom)}, which is terrain or in another file, are left out"
+            f"the pairs with {listed(others)}, which is terrain or in another file, are left out"
         )
-    return [pair for pairs in by_geom.values() for pair in pairs]
+    return pairs
 
 
 def _lost(meshes: Iterable[mujoco.MjsMesh], sentence: str) -> list[mujoco.MjsMesh]:
@@ -268,11 +264,12 @@ def _leave_out(
     low, high = spec.compiler.inertiagrouprange
     always = _always_from_geoms(spec)
     for geom in geoms:
+        body = geom.parent
         weighs = geom.mass > 0 if np.isfinite(geom.mass) else geom.density > 0
-        counts = always or not geom.parent.explicitinertial
-        if weighs and counts and low <= geom.group <= high and geom.parent.name != "world":
+        counts = always or not body.explicitinertial
+        if weighs and counts and low <= geom.group <= high and body.name != "world":
             raise RobotError(
-                f"{path.name}: body {geom.parent.name!r}: its mass and inertia are those of the "
+                f"{path.name}: body {body.name!r}: its mass and inertia are those of the "
                 f"mesh {files[geom.meshname]!r}, which is not there or cannot be read; put it into "
                 f"{str(path.parent / spec.compiler.meshdir)!r}, or give the body an <inertial>"
             )
@@ -290,16 +287,16 @@ def _leave_out(
 
 def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
     """The body at the world that carries the robot: the one with the most hinges."""
-    tops = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
-    turns = (model.jnt_type == JOINT.mjJNT_HINGE) | (model.jnt_type == JOINT.mjJNT_BALL)
+    tops = np.flatnonzero(model.body_parentid[1:] == 0) + 1
+    turns = np.isin(model.jnt_type, TURNING)
     below = model.jnt_bodyid[turns & (model.body_parentid[model.jnt_bodyid] > 0)]
     hinges = np.bincount(model.body_rootid[below], minlength=model.nbody)
-    most = int(hinges.max())
-    robots = [top for top in tops if hinges[top] == most]
-    names = listed(model.body(top).name for top in robots)
+    most = hinges.max()
+    robots = [int(top) for top in tops if hinges[top] == most]
     if not most:
         raise RobotError(f"{where}: no body hangs on another by a hinge; a robot needs legs")
     if len(robots) > 1:
+        names = listed(model.body(top).name for top in robots)
         raise RobotError(
             f"{where}: the bodies {names} of the world have {most} hinges each below them, "
             f"{len(robots)} robots; take out all but one"
@@ -313,16 +310,16 @@ def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
 # --------------------------------------------------------------------------------------------------
 def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
     """Least and greatest force (2,) of an actuator, before its gear; infinite if nothing says."""
-    group = int(model.actuator_group[a])
-    disabled = bool(model.opt.disableactuator >> group & 1)
-    if disabled or not (np.any(model.actuator_gainprm[a, :2]) or model.actuator_biastype[a]):
-        return np.zeros(2)  # switched off, or a damper
+    switched_off = model.opt.disableactuator >> model.actuator_group[a] & 1
+    unbiased = model.actuator_biastype[a] == BIAS.mjBIAS_NONE
+    damper = unbiased and not np.any(model.actuator_gainprm[a, :2])
+    if switched_off or damper:
+        return np.zeros(2)
     ends = np.array([-np.inf, np.inf])
     if model.actuator_forcelimited[a]:
         ends = model.actuator_forcerange[a].copy()
-    fixed = model.actuator_gaintype[a] == GAIN.mjGAIN_FIXED
     plain = model.actuator_ctrllimited[a] and model.actuator_dyntype[a] in PLAIN
-    if fixed and model.actuator_biastype[a] == BIAS.mjBIAS_NONE:
+    if unbiased and model.actuator_gaintype[a] == GAIN.mjGAIN_FIXED:
         if plain or model.actuator_actlimited[a]:
             given = model.actuator_ctrlrange[a] if plain else model.actuator_actrange[a]
             ends = np.clip(np.sort(model.actuator_gainprm[a, 0] * given), *ends)
@@ -336,37 +333,28 @@ class _Loop:
     """
 
     name: str
-    ends: tuple[int, int]
+    ends: list[int]
     ways: list[list[int]]
     joints_there: list[list[int]]
-
-    @property
-    def joints(self) -> list[int]:
-        """The hinges on both ways, by number."""
-        return sorted(k for way in self.ways for k in way)
 
 
 def _loops(model: mujoco.MjModel) -> Iterator[_Loop]:
     hinges = (model.jnt_type == JOINT.mjJNT_HINGE) & (model.jnt_stiffness == 0)
-    for e in np.flatnonzero(model.eq_active0):
-        if model.eq_type[e] in TIES:
-            ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
-            if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
-                ends = tuple(int(model.site_bodyid[x]) for x in ends)
-            one, two = ({*_up(model, body)} for body in ends)
-            there = [np.isin(model.jnt_bodyid, [*way]) for way in (one - two, two - one)]
-            ways = [np.flatnonzero(way & hinges).tolist() for way in there]
-            name = model.equality(e).name or str(e)
-            yield _Loop(name, ends, ways, [np.flatnonzero(way).tolist() for way in there])
+    for e in np.flatnonzero(model.eq_active0 & np.isin(model.eq_type, TIES)):
+        ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
+        if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+            ends = model.site_bodyid[ends].tolist()
+        one, two = ({*_up(model, body)} for body in ends)
+        there = [np.isin(model.jnt_bodyid, [*way]) for way in (one - two, two - one)]
+        ways = [np.flatnonzero(way & hinges).tolist() for way in there]
+        joints = [np.flatnonzero(way).tolist() for way in there]
+        yield _Loop(model.equality(e).name or str(e), ends, ways, joints)
 
 
-def _curves(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
-    """Equalities by which a joint follows another along no line: number, and both joints."""
-    for e in np.flatnonzero((model.eq_type == EQUALITY.mjEQ_JOINT) & model.eq_active0):
-        ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
-        bent = np.any(model.eq_data[e, 2:5]) or not model.eq_data[e, 1]
-        if ends[1] >= 0 and bent:
-            yield int(e), *ends
+def _bent(model: mujoco.MjModel, e: int) -> bool:
+    """Whether a joint follows another, by an equality of joints, along no line."""
+    _, factor, *further = model.eq_data[e, :5]
+    return model.eq_obj2id[e] >= 0 and (any(further) or not factor)
 
 
 def _up(model: mujoco.MjModel, body: int) -> Iterator[int]:
@@ -389,23 +377,21 @@ class _Motors:
         self.others = []  # actuators that are not counted
         for a in range(model.nu):
             self._add(model, a)
+        driven = model.jnt_bodyid[self.driven[model.jnt_dofadr]]
+        carried = {above for body in driven for above in _up(model, model.body_parentid[body])}
         for loop in _loops(model):
             # a chain that only holds another one, which goes on, gets no motor by that
-            on = [self._goes_on(model, end) for end in loop.ends]
+            on = [end in carried for end in loop.ends]
             for way, leads in zip(loop.ways, on, strict=True):
                 self.pulled[model.jnt_dofadr[way]] |= leads or not any(on)
-        for _, *ends in _curves(model):  # by a lever that changes
-            self.pulled[model.jnt_dofadr[ends]] = True
+        for e in np.flatnonzero(model.eq_active0 & (model.eq_type == EQUALITY.mjEQ_JOINT)):
+            if _bent(model, e):  # by a lever that changes
+                self.pulled[model.jnt_dofadr[[model.eq_obj1id[e], model.eq_obj2id[e]]]] = True
         for k in np.flatnonzero(model.jnt_actfrclimited):
             dof = model.jnt_dofadr[k]
             given = self.torque[dof] if self.driven[dof] else [-np.inf, np.inf]
             self.torque[dof] = np.clip(given, *model.jnt_actfrcrange[k])
             self.driven[dof] = True
-
-    def _goes_on(self, model: mujoco.MjModel, end: int) -> bool:
-        """Whether a joint with a motor hangs on a body."""
-        bodies = model.jnt_bodyid[self.driven[model.jnt_dofadr]]
-        return any(end in _up(model, int(model.body_parentid[body])) for body in bodies)
 
     def _add(self, model: mujoco.MjModel, a: int) -> None:
         kind = model.actuator_trntype[a]
@@ -419,14 +405,14 @@ class _Motors:
             elif kind != TRANSMISSION.mjTRN_BODY:
                 self.pulled[:] = True
             return
-        dof = model.jnt_dofadr[k]
         count = 3 if model.jnt_type[k] == JOINT.mjJNT_BALL else 1
-        for i, gear in enumerate(model.actuator_gear[a, :count]):
-            if gear:
-                self.torque[dof + i] += np.sort(gear * _force(model, a))
-                self.driven[dof + i] = True
-                self.armature[dof + i] += gear**2 * model.actuator_armature[a]
-                self.damping[dof + i] += gear**2 * model.actuator_damping[a]
+        used = np.flatnonzero(model.actuator_gear[a, :count])
+        gear = model.actuator_gear[a, used]
+        dofs = model.jnt_dofadr[k] + used
+        self.torque[dofs] += np.sort(np.outer(gear, _force(model, a)))
+        self.driven[dofs] = True
+        self.armature[dofs] += gear**2 * model.actuator_armature[a]
+        self.damping[dofs] += gear**2 * model.actuator_damping[a]
 
     def effort(self, dof: int) -> float | None:
         """The torque that a joint has both ways [N m], the weaker way; None if nothing says."""
@@ -462,30 +448,41 @@ class _Writer:
             for g in range(model.ngeom)
         ]
 
-    def add_body(self, i: int) -> None:
-        """A body's link and the joints above it, with links without mass between several."""
+    def write(self) -> None:
+        """Links with the joints above them, then what is between joints, and what is left out."""
+        for i in self.bodies:
+            joints = [int(k) for k in np.flatnonzero(self.model.jnt_bodyid == i)]
+            base = [k for k in joints if self.model.jnt_type[k] != JOINT.mjJNT_FREE]
+            if i != self.root:
+                self._add_joints(i, joints)
+            elif base:
+                self.notes.append(
+                    f"the joints {self._joints(base)} join the body {self.names[i]!r} to the "
+                    f"world: left out, it moves freely"
+                )
+            self._add_link(i)
+        self._add_equalities()
+        self._note_what_is_left_out()
+
+    def _add_joints(self, i: int, joints: list[int]) -> None:
+        """The joints above a body, with links without mass between several."""
         model = self.model
         name = self.names[i]
-        joints = [int(k) for k in np.flatnonzero(model.jnt_bodyid == i)]
-        if i == self.root:
-            if base := [k for k in joints if model.jnt_type[k] != JOINT.mjJNT_FREE]:
-                self.notes.append(
-                    f"the joints {self._joints(base)} join the body {name!r} to the world: left "
-                    f"out, it moves freely"
-                )
-        else:
-            above = self.names[model.body_parentid[i]]
-            place = _place(model.body_pos[i], model.body_quat[i])
-            for k in joints:
-                above, place = self._add_joint(k, above, place, name, k == joints[-1])
-            if above != name:
-                add_joint(self.xml, f"{name}_fixed", "fixed", (above, name), place)
+        above = self.names[model.body_parentid[i]]
+        place = _place(model.body_pos[i], model.body_quat[i])
+        for k in joints:
+            above, place = self._add_joint(k, above, place, name, k == joints[-1])
+        if above != name:
+            add_joint(self.xml, f"{name}_fixed", "fixed", (above, name), place)
+
+    def _add_link(self, i: int) -> None:
+        model = self.model
         middle = _place(model.body_ipos[i], model.body_iquat[i])
         inertia = pin.Inertia(model.body_mass[i], np.zeros(3), np.diag(model.body_inertia[i]))
-        link = add_link(self.xml, name, middle.act(inertia))
+        link = add_link(self.xml, self.names[i], middle.act(inertia))
         for g in np.flatnonzero(model.geom_bodyid == i):
             if model.geom_type[g] != GEOM.mjGEOM_PLANE:
-                self._add_shape(link, int(g))
+                self._add_shape(link, g)
 
     def _add_joint(
         self, k: int, above: str, place: pin.SE3, body: str, last: bool
@@ -570,39 +567,44 @@ class _Writer:
     def _joints(self, numbers: Iterable[int]) -> str:
         return listed(self.model.joint(int(k)).name or f"joint_{k}" for k in numbers)
 
-    def add_equalities(self) -> None:
+    def _add_equalities(self) -> None:
         """Joints that follow others, as mimics; what ties bodies is named."""
         model = self.model
         for e in np.flatnonzero(model.eq_active0):
-            one, other = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+            ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
             kind = model.eq_type[e]
             name = f"the equality {model.equality(e).name or int(e)!r}"
-            if kind == EQUALITY.mjEQ_JOINT:
-                if one in self.joints:
-                    self._follow(name, one, other, model.eq_data[e, :5])
+            if kind == EQUALITY.mjEQ_JOINT and _bent(model, e):
+                if ends[0] in self.joints:
+                    self.notes.append(
+                        f"{name} couples the joints {self._joints(ends)} along a curve: left out, "
+                        f"they move as if it were cut; those of a leg without a motor need in "
+                        f"[limits] the effort that it gives them"
+                    )
+                self._tie(name, [[k] for k in ends])
+            elif kind == EQUALITY.mjEQ_JOINT:
+                if ends[0] in self.joints:
+                    self._follow(name, *ends, *model.eq_data[e, :2])
             elif kind == EQUALITY.mjEQ_TENDON:
-                joints = [k for tendon in (one, other) for k in self._joints_of(tendon)]
+                joints = [k for tendon in ends for k in self._joints_of(tendon)]
                 pulls = f" of the joints {self._joints(joints)}" if joints else ""
                 self.notes.append(f"{name} of tendons{pulls} is left out")
                 self._tie(name, [[k] for k in joints])
             elif kind not in TIES:
                 self.notes.append(f"{name} of flexes is left out")
-        for number, *ends in _curves(model):
-            self._tie(
-                f"the equality {model.equality(number).name or number!r}", [[k] for k in ends]
-            )
         for loop in _loops(model):
+            name = f"the equality {loop.name!r}"
             if set(loop.ends) <= set(self.bodies):
-                self._tie(f"the equality {loop.name!r}", loop.joints_there)
+                self._tie(name, loop.joints_there)
             if set(loop.ends) & set(self.bodies):
                 tied = " to ".join(repr(model.body(x).name) for x in loop.ends)
+                joints = sorted(chain(*loop.ways))
                 cut = (
-                    f", the joints {self._joints(loop.joints)} of this closed chain move as if it "
+                    f", the joints {self._joints(joints)} of this closed chain move as if it "
                     f"were cut; those of a leg without a motor need in [limits] the effort that "
                     f"the chain gives them"
                 )
-                cut = cut if loop.joints else ""
-                self.notes.append(f"the equality {loop.name!r} ties {tied}: left out{cut}")
+                self.notes.append(f"{name} ties {tied}: left out{cut if joints else ''}")
 
     def _joints_of(self, tendon: int) -> list[int]:
         """The joints of this robot that a tendon takes as they are; none of one that winds."""
@@ -618,35 +620,28 @@ class _Writer:
         tie = add(self.xml, "tie", by=by)
         for way in ways:
             part = add(tie, "way")
-            for name in (name for k in way for name in self.joints.get(k, [])):
-                add(part, "of", joint=name)
+            for k in way:
+                for name in self.joints.get(k, ()):
+                    add(part, "of", joint=name)
 
-    def _follow(self, name: str, one: int, other: int, curve: np.ndarray) -> None:
-        """The mimic of a joint that follows another, the one with a motor, along a line."""
-        model = self.model
-        offset, factor = curve[:2]  # from where both joints count
-        named = self._joints(k for k in (one, other) if k >= 0)
-        if np.any(curve[2:]) or (other >= 0 and not factor):
-            self.notes.append(
-                f"{name} couples the joints {named} along a curve: left out, they move as if it "
-                f"were cut; those of a leg without a motor need in [limits] the effort that it "
-                f"gives them"
-            )
-            return
-        driven = self.motors.driven[model.jnt_dofadr]
+    def _follow(self, name: str, one: int, other: int, offset: float, factor: float) -> None:
+        """The mimic of a joint that follows another, the one with a motor, along a line, from where
+        both joints count.
+        """
+        driven = self.motors.driven[self.model.jnt_dofadr]
         if other >= 0 and driven[one] and not driven[other]:
             one, other = other, one
             factor, offset = 1 / factor, -offset / factor
         follower = next(j for j in self.xml.iter("joint") if j.get("name") == self.joints[one][0])
         if other < 0:
-            limit = follower.find("limit")
-            limit.attrib |= {"effort": "0", "lower": f"{offset:.12g}", "upper": f"{offset:.12g}"}
-            self.notes.append(f"{name} holds the joint {named} at {offset:.3g}")
+            held = {"effort": "0", "lower": f"{offset:.12g}", "upper": f"{offset:.12g}"}
+            follower.find("limit").attrib.update(held)
+            self.notes.append(f"{name} holds the joint {self._joints([one])} at {offset:.3g}")
         elif other in self.joints:
             leader = self.joints[other][0]
             add(follower, "mimic", joint=leader, multiplier=factor, offset=offset)
 
-    def note_what_is_left_out(self) -> None:
+    def _note_what_is_left_out(self) -> None:
         """Springs, tendons, compensation of gravity, and actuators that act on no joint."""
         model = self.model
         counted = self._joints(k for k in self.joints if self.ref[k])

@@ -22,14 +22,13 @@ from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import.checks import (
     MOST_RAD,
     MOST_RAD_S,
-    keys_of,
     limit_faults,
     notes,
     read_tree,
     wrong_limits,
 )
 from jumplab.robot_import.feet import Sole, find_sole, refuse_wheel, sole_points, thickness
-from jumplab.robot_import.urdf import MOVING, Joint, Tree, read_urdf
+from jumplab.robot_import.urdf import LIMITS, MOVING, Joint, Tree, across, read_urdf
 from jumplab.robot_import.write import key, listed
 
 # None of these numbers is printed by the paper.
@@ -101,6 +100,11 @@ class Roles:
     notes: tuple[str, ...]  # what a person should know, one sentence each
 
 
+def opposite(axis: str) -> str:
+    """A signed axis such as "+x", the other way."""
+    return axis.translate(str.maketrans("+-", "-+"))
+
+
 def robot_axes(frame: np.ndarray, forward: str, up: str) -> np.ndarray:
     """(3, 3) from the axes of the URDF's root to x forward, y left, z up.
 
@@ -119,9 +123,6 @@ class _Finder:
         self.tree = tree
         self.lateral = AXES[guess[:2]]
         self.up = AXES[guess[2:]]
-        poses = {joint: tree.pose[joint.child] for joint in tree.joints.values()}
-        self.at = {joint: pose.translation for joint, pose in poses.items()}
-        self.axis = {joint: pose.rotation @ joint.axis for joint, pose in poses.items()}
         self.tips = self._tips(every_kind)
         self.legs = self._legs()
 
@@ -146,12 +147,11 @@ class _Finder:
         chains = [chain for tip, chain in unique.items() if tip not in inner]
         out = []
         for a, b in combinations(chains, 2):
-            gap = self.at[b[-1]] - self.at[a[-1]]
-            side = float(gap @ self.lateral)
-            axis = self.axis[b[-1]]  # an origin may lie anywhere on its axis
-            across = gap - side * self.lateral
-            across = across - (across @ axis) * axis
-            mirrored = abs(side) >= SAME_M >= norm(across)
+            gap = b[-1].at - a[-1].at
+            side = gap @ self.lateral
+            # an origin may lie anywhere on its axis
+            apart = across(across(gap, self.lateral), b[-1].direction)
+            mirrored = abs(side) >= SAME_M >= norm(apart)
             shared = sum(x is y for x, y in zip(a, b, strict=False))
             if mirrored and shared < len(a) == len(b):
                 pair = (a[shared:], b[shared:])
@@ -160,7 +160,7 @@ class _Finder:
 
     def turning(self, joint: Joint) -> float:
         """Cosine [1] between a joint's axis and the lateral one."""
-        return abs(self.axis[joint] @ self.lateral)
+        return abs(joint.direction @ self.lateral)
 
     def pitch(self, chain: Chain) -> Chain:
         """Joints of a chain about the lateral axis, more or less (by :data:`SWINGS`)."""
@@ -173,7 +173,7 @@ class _Finder:
         pitch = self.pitch(chain)
 
         def shorter(three: tuple[Joint, ...]) -> float:
-            flat = np.array([self.at[j] for j in three]) * (1 - np.abs(self.lateral))
+            flat = np.array([j.at for j in three]) * (1 - np.abs(self.lateral))
             turning = np.prod([self.turning(j) for j in three])
             return turning * min(norm(np.diff(flat, axis=0), axis=1))
 
@@ -181,39 +181,38 @@ class _Finder:
         if not best or shorter(best) <= 1e-3:
             return ()
         hip, knee, ankle = best
-        at = self.at
         for joint in pitch[pitch.index(knee) + 1 : pitch.index(ankle)]:
-            shank = norm(at[joint] - at[knee])
-            foot = at[ankle] - at[joint]
-            flat = abs(foot @ self.up) < norm(foot - (foot @ self.up) * self.up)
+            shank = norm(joint.at - knee.at)
+            foot = ankle.at - joint.at
+            flat = abs(foot @ self.up) < norm(across(foot, self.up))
             if flat and 0 < norm(foot) < FOOT_LIKE * shank:
                 return hip, knee, joint
         return best
 
     def leg_m(self) -> float:
         """Length of a leg from hip to ankle [m]."""
-        hip, _, ankle = (self.at[joint] for joint in self.legs[0][0])
-        return float(norm(hip - ankle))
+        hip, _, ankle = self.legs[0][0]
+        return float(norm(hip.at - ankle.at))
 
     def along(self, three: tuple[Joint, ...]) -> bool:
         """True if the leg hangs (from hip to ankle), and ends where the robot does, on a foot."""
         if not three:
             return False
-        leg, _, foot = (self.tree.carried(joint.child) for joint in three)
-        if 0 < foot < LIGHT_FOOT * leg:
+        hip, _, ankle = three
+        carried = self.tree.carried
+        if 0 < carried(ankle.child) < LIGHT_FOOT * carried(hip.child):
             return False
-        hip, _, ankle = (self.at[joint] for joint in three)
-        heights = np.array([*self.at.values()]) @ self.up
+        leg = hip.at - ankle.at
+        heights = np.array([joint.at for joint in self.tree.joints.values()]) @ self.up
         tall = np.ptp(heights)
-        low = ankle @ self.up < heights.min() + LOWEST * tall
-        low = low and norm(hip - ankle) > SHORTEST_LEG * tall
-        return low and (hip - ankle) @ self.up > STEEP * norm(hip - ankle)
+        low = ankle.at @ self.up < heights.min() + LOWEST * tall
+        return low and norm(leg) > SHORTEST_LEG * tall and leg @ self.up > STEEP * norm(leg)
 
     def _legs(self) -> list[tuple[tuple[Joint, ...], Chain]]:
         """(hip, knee, ankle) and chain of both legs: the lowest mirrored pair; [] without any."""
         pairs = [[(self.triple(chain), chain) for chain in limb] for limb in self.limbs()]
         pairs = [pair for pair in pairs if self.along(pair[0][0]) and pair[1][0]]
-        return min(pairs, key=lambda pair: self.at[pair[0][0][2]] @ self.up, default=[])
+        return min(pairs, key=lambda pair: pair[0][0][2].at @ self.up, default=[])
 
     def refuse_four(self) -> None:
         """Raise if other limbs stand as well: arms end higher."""
@@ -229,16 +228,16 @@ class _Finder:
 
     def foot(self, three: tuple[Joint, ...], chain: Chain) -> str:
         """The link that stands: behind the ankle, before any toe joint (a further pitch joint)."""
-        _, knee, ankle = (self.at[joint] for joint in three)
-        near = TOES * norm(ankle - knee)
+        _, knee, ankle = three
+        near = TOES * norm(ankle.at - knee.at)
 
         def of_ankle(joint: Joint) -> bool:
-            across = self.at[joint] - ankle  # an origin may lie anywhere on its axis
-            across = across - (across @ self.axis[joint]) * self.axis[joint]
-            return norm(across) < near and self.turning(joint) < SWINGS
+            # an origin may lie anywhere on its axis
+            apart = across(joint.at - ankle.at, joint.direction)
+            return norm(apart) < near and self.turning(joint) < SWINGS
 
-        still = takewhile(of_ankle, chain[chain.index(three[2]) + 1 :])
-        return [three[2], *still][-1].child
+        still = takewhile(of_ankle, chain[chain.index(ankle) + 1 :])
+        return [ankle, *still][-1].child
 
     def ahead(self, forward: np.ndarray) -> float:
         """Reach of the feet ahead of the ankles minus that behind, halved [m], if they point along
@@ -252,7 +251,7 @@ class _Finder:
             x = around[:, 0]
             if not len(x):
                 x = [self.tree.pose[foot].rotation @ self.tree.body_of(foot).lever @ forward]
-            away = (self.tree.pose[foot].translation - self.at[three[2]]) @ forward
+            away = (self.tree.pose[foot].translation - three[2].at) @ forward
             out.append(float((np.max(x) + np.min(x)) / 2 + away))
         return max(out)
 
@@ -264,7 +263,7 @@ class _Finder:
         for joint in joints:
             low, high = (joint.limits.get(end, 0.0) for end in ("lower", "upper"))
             real = max(abs(low), abs(high)) <= MOST_RAD
-            sums.append((low + high) * np.sign(self.axis[joint] @ left) * real)
+            sums.append((low + high) * np.sign(joint.direction @ left) * real)
         mean = float(np.mean(sums)) if sums else 0.0
         return float(np.sign(mean)) * (abs(mean) >= EVEN_RAD)
 
@@ -390,7 +389,7 @@ def _assumed(
         limits = {}
         if not {"lower", "upper"} <= set(joint.limits):
             low, high = ASSUMED_RAD[role]
-            turned = finder.axis[joint] @ left < 0
+            turned = joint.direction @ left < 0
             limits["lower"] = 0.0 - high if turned else low
             limits["upper"] = 0.0 - low if turned else high
         if role == "other" and MOST_RAD_S < joint.limits.get("velocity", 0.0) <= 2 * MOST_RAD_S:
@@ -457,7 +456,7 @@ def _explain(tree: Tree) -> NoReturn:
     if len(hanging) == 2:
         one, other = hanging
         legs = f"the legs that end with the joints {one.name!r} and {other.name!r}"
-        gap = finder.at[one] - finder.at[other]
+        gap = one.at - other.at
         if abs(gap @ finder.lateral) < SAME_M:
             raise tree.error(f"{legs} are none to the left and none to the right of the trunk")
         apart = 1e3 * norm(gap * (1 - np.abs(finder.lateral)))
@@ -506,11 +505,11 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     try:
         roles = find_roles(tree)
         turn = robot_axes(tree.pose[roles.trunk].rotation, roles.forward, roles.up)
-        hip, _, ankle = (tree.pose[tree.joints[roles.joints[r][0]].child].translation for r in LEG)
+        hip, _, ankle = (tree.joints[roles.joints[role][0]].at for role in LEG)
         leg_m = float(norm((turn @ (hip - ankle))[[0, 2]]))
         sole = find_sole(tree, roles.feet[0], turn, leg_m)
     except RobotError as e:
-        for note in (*notes(tree), *dict.fromkeys(tree.notes)):
+        for note in notes(tree):
             e.add_note(note)
         raise
     asked = {}  # table -> limits that the file lacks
@@ -519,27 +518,26 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     for joint in dict.fromkeys(names + leg_joints(tree, roles.trunk, roles.feet)):
         given = roles.assumed.get(joint, {})
         title = f"limits.{key(joint)}"
-        if parts := keys_of(wrong_limits(tree, joint, given)):
-            asked[title] = parts
+        if wrong := wrong_limits(tree, joint, given):
+            asked[title] = sorted(wrong, key=LIMITS.index)
         faults += limit_faults(tree, joint, given, title)
     # a short name of letters, digits, - and _
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
     config = filled(
         "robot_import/starter.toml.in",
         key=key,
-        notes=roles.notes,
         name=name or "robot",
         urdf=path.resolve().as_posix(),
         roles=roles,
         repair=repair,
         sole=sole,
-        other=roles.forward.translate(str.maketrans("+-", "-+")),
+        other=opposite(roles.forward),
         knee=_inside(tree, turn[1], roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
         asked=asked,
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
-    roles = replace(roles, notes=(*notes(tree), *dict.fromkeys(tree.notes), *roles.notes))
+    roles = replace(roles, notes=(*notes(tree), *roles.notes))
     return Draft(config, roles, sole, tree, tuple(faults))
 
 
@@ -548,7 +546,7 @@ def _inside(tree: Tree, left: np.ndarray, pair: tuple[str, ...], wish: float) ->
     low = -np.inf
     high = np.inf
     for joint in (tree.joints[name] for name in pair):
-        sign = np.sign(left @ tree.pose[joint.child].rotation @ joint.axis)
+        sign = np.sign(left @ joint.direction)
         ends = joint.limits.get("lower", -np.pi), joint.limits.get("upper", np.pi)
         low = max(low, min(sign * np.array(ends)))
         high = min(high, max(sign * np.array(ends)))

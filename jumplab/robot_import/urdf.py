@@ -25,6 +25,7 @@ from jumplab import reading
 from jumplab.errors import RobotError
 from jumplab.io.progress import tell
 from jumplab.robot.changes import MOMENTS
+from jumplab.robot.contact import posed
 from jumplab.robot.files import read_text
 from jumplab.robot.sagittal import box_corners
 from jumplab.robot_import.write import HERE
@@ -239,6 +240,11 @@ def placed(place: pin.SE3, points: np.ndarray) -> np.ndarray:
     return points @ place.rotation.T + place.translation
 
 
+def across(vector: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """A ``vector`` (3,) without its part along a unit ``axis`` (3,)."""
+    return vector - (vector @ axis) * axis
+
+
 def mass_of(link: ET.Element) -> float:
     """Mass of a link [kg]; 0 without an ``<inertial>``."""
     mass = link.find("inertial/mass")
@@ -302,6 +308,9 @@ class Joint:
     mimic: tuple[str, float, float] | None  # leader, multiplier, offset
     driven: bool  # it turns by a motor of its own, between two stops or without
     element: ET.Element = field(repr=False)
+    # with all joints at 0, in the root's frame (3,): its origin [m], and its axis
+    at: np.ndarray = field(init=False)
+    direction: np.ndarray = field(init=False)
 
     @classmethod
     def read(cls, e: ET.Element) -> Joint:
@@ -309,17 +318,23 @@ class Joint:
         axis, limit, mimic, dynamics = (e.find(x) for x in ("axis", "limit", "mimic", "dynamics"))
         direction = np.array([1.0, 0.0, 0.0]) if axis is None else numbers(axis.get("xyz"), 3)
         limits = finite(limit, LIMITS)
-        losses = {key: x for key, x in finite(dynamics, OWN).items() if x > 0}
         kind = e.get("type")
-        driven = kind in ("revolute", "continuous") and limits.get("effort") != 0 and mimic is None
         follows = None
         if mimic is not None:
             line = {"multiplier": 1.0, "offset": 0.0} | finite(mimic, ("multiplier", "offset"))
             follows = (mimic.get("joint"), *line.values())
-        ends = (e.find(end).get("link") for end in ("parent", "child"))
-        axis = direction / max(np.linalg.norm(direction), 1e-12)
-        place = _place(e)
-        return cls(e.get("name"), kind, *ends, place, axis, limits, losses, follows, driven, e)
+        return cls(
+            e.get("name"),
+            kind,
+            *(e.find(end).get("link") for end in ("parent", "child")),
+            _place(e),
+            direction / max(np.linalg.norm(direction), 1e-12),
+            limits,
+            {key: x for key, x in finite(dynamics, OWN).items() if x > 0},
+            follows,
+            kind in ("revolute", "continuous") and limits.get("effort") != 0 and mimic is None,
+            e,
+        )
 
 
 class Tree:
@@ -373,8 +388,10 @@ class Tree:
         for key, ratio in zip(OWN, (factor**-2, 1 / abs(factor), factor**-2), strict=True):
             if lost := joint.losses.get(key, 0.0) + ratio * motor.losses.get(key, 0.0):
                 joint.losses[key] = lost
-        joint.mimic, motor.mimic = None, (joint.name, 1 / factor, -offset / factor)
-        joint.driven, motor.driven = True, False
+        joint.mimic = None
+        motor.mimic = (joint.name, 1 / factor, -offset / factor)
+        joint.driven = True
+        motor.driven = False
         self.notes.append(
             f"joint {joint.name!r} is moved by the motor of {motor.name!r}, by a gear of {factor:g}"
         )
@@ -398,11 +415,14 @@ class Tree:
             self.model.addFrame(frame)
             below = [j for j in self.joints.values() if j.parent == link]
             todo += [(j.child, carrier, place * j.place, j.name, j.kind, j.axis) for j in below]
-        data = self.model.createData()
         self.mass = pin.computeTotalMass(self.model)
-        pin.computeSubtreeMasses(self.model, data)
-        self._masses = list(data.mass)
+        data = posed(self.model)
+        self._masses = [*data.mass]
         self.pose = link_poses(self.model)
+        for joint in self.joints.values():
+            pose = self.pose[joint.child]
+            joint.at = pose.translation
+            joint.direction = pose.rotation @ joint.axis
 
     def error(self, text: str) -> RobotError:
         """An error that begins with the file's name."""
@@ -421,12 +441,12 @@ class Tree:
 
         Floating joints are not held.
         """
-        still = [j for j in self.joints.values() if j.kind in MOVING and j.name not in moving]
-        at = np.zeros(self.model.nv)
-        for name in (j.name for j in still if j.name in held):
-            at[self.model.idx_vs[self.model.getJointId(name)]] = held[name]
-        q = pin.integrate(self.model, pin.neutral(self.model), at)
-        return pin.buildReducedModel(self.model, [self.model.getJointId(j.name) for j in still], q)
+        model = self.model
+        still = [j.name for j in self.joints.values() if j.kind in MOVING and j.name not in moving]
+        joints = [model.getJointId(name) for name in still]
+        at = np.zeros(model.nv)
+        at[[model.idx_vs[j] for j in joints]] = [held.get(name, 0.0) for name in still]
+        return pin.buildReducedModel(model, joints, pin.integrate(model, pin.neutral(model), at))
 
     def chain(self, link: str) -> list[Joint]:
         """Joints (in order) from the root to a link."""
@@ -516,8 +536,7 @@ def links_of(model: pin.Model) -> dict[str, int]:
 
 def link_poses(model: pin.Model) -> dict[str, pin.SE3]:
     """Place of every link [m] in the world with all joints at 0, by name."""
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    data = posed(model)
     return {name: data.oMf[i].copy() for name, i in links_of(model).items()}
 
 

@@ -11,14 +11,10 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.forms import toml
+from jumplab.robot.contact import shifted
 
 MOST_NAMES = 6  # that a sentence lists
 HERE = pin.SE3.Identity()
-
-
-def shifted(place: np.ndarray) -> pin.SE3:
-    """Axes that are not turned, at ``place`` (3,) [m]."""
-    return pin.SE3(np.eye(3), np.array(place, float))
 
 
 def add(parent: ET.Element, tag: str, **values: Any) -> ET.Element:
@@ -67,19 +63,6 @@ def add_link(robot: ET.Element, name: str, inertia: pin.Inertia) -> ET.Element:
     ends = zip(*np.triu_indices(3), strict=True)
     add(inertial, "inertia", **{f"i{'xyz'[i]}{'xyz'[k]}": m[i, k] for i, k in ends})
     return link
-
-
-def add_boxes(
-    link: ET.Element,
-    kind: str,
-    boxes: Iterable[tuple[np.ndarray, np.ndarray]],
-    axes: pin.SE3 = HERE,
-) -> None:
-    """Boxes (centre, size) [m] along ``axes`` in the link; ``kind`` is "visual" or "collision"."""
-    for centre, size in boxes:
-        shape = add(link, kind)
-        add_origin(shape, axes * shifted(centre))
-        add(add(shape, "geometry"), "box", size=size)
 
 
 def listed(names: Iterable[Any]) -> str:
