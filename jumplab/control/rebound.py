@@ -15,17 +15,16 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from jumplab.control import STEP_S
-from jumplab.control.body import PERIOD_STEPS, corner_rows
+from jumplab.control.body import PERIOD_STEPS, PITCH, Footing
 from jumplab.control.flight import Flight
 from jumplab.control.kinematics import Gauge, State
-from jumplab.control.landing import GAINS, PLANNED_FRICTION, LandingController
-from jumplab.control.launch import FADE_SHARE, balance_rows, toes
-from jumplab.control.playback import AIR, FLAT, Command, Playback, resampled
+from jumplab.control.landing import GAINS, PLANNED_FRICTION, SOLE_SHARE, LandingController
+from jumplab.control.launch import FADE_SHARE, balance_rows
+from jumplab.control.playback import AIR, FLAT, Command, Playback
 from jumplab.control.reaim import Reaim
 from jumplab.io import tape as tapes
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.robot.contact import on_feet
 from jumplab.robot.legs import size
 
 # the next flight hangs on height, place and angular momentum at its start. Two bounds of four
@@ -43,29 +42,18 @@ TRACKING = replace(
 NEAR_S = 0.03
 # of soles to the axes of the last landing, in which the CoP's and the legs' rows are written
 ALONG_RAD = 0.3
-PITCH = 4  # of a foot's twist, free on its toe
 
 
 class Tracker(LandingController):
-    """Torques that lead the robot along the tape while its feet stand; ``q`` and ``v`` are the
-    tape's, on the grid of control.
-    """
+    """Torques that lead the robot along the tape while its feet stand."""
 
     def __init__(self, robot: Robot, tape: Tape, playback: Playback, force_noise_n: float):
         super().__init__(robot, force_noise_n=force_noise_n, gains=TRACKING)
         self._gauge = Gauge(robot)
         self._playback = playback
-        grid = np.arange(playback.steps + 1) * STEP_S
         self._rows = balance_rows(robot, tape, playback.steps)
-        self.q = resampled(grid, tape.t, tape.q)
-        self.v = resampled(grid, tape.t, tape.v)
         self._due = 0
-        flat = on_feet(robot, robot.foot.center), self._corners
-        toe = on_feet(robot, robot.foot.tip), corner_rows(robot, PLANNED_FRICTION, 0.0, 1.0)
-        self._stands = {
-            stand: (anchors, np.split(rows, 2))
-            for stand, (anchors, rows) in {tapes.FLAT: flat, tapes.TOE: toe}.items()
-        }
+        self._footing = Footing(robot, PLANNED_FRICTION, *SOLE_SHARE)
 
     def begin(self) -> None:
         """Feet come down once more, perhaps on other ground."""
@@ -81,22 +69,15 @@ class Tracker(LandingController):
         if self._playback.stands(due) != AIR:  # of a take-off that is due, the last contact
             self._due = due
         self._stand = self._playback.stands(self._due)
-        q, v = self.q[self._due], self.v[self._due]
+        self._planned = q, v, gained = self._playback.planned(self._due)
         self._rest = q[7:]
         self._rest_rates = v[6:]
-        gained = (self.v[self._due + 1] - v) / STEP_S
         self._rest_push = gained[6:]
-        self._planned = q, v, gained
-        parts = [
-            (self._stands[x][0][side], self._stands[x][1][side])
-            for side, x in enumerate(self._stand)
-        ]
-        self._anchors = [anchor for anchor, _ in parts]
-        self._corners = np.vstack([rows for _, rows in parts])
-        com, self._speed, self._push, self._momentum, self._twist, *places = self._rows[self._due]
+        self._anchors, self._corners = self._footing.of(self._stand)
+        com, *goal, left, right = self._rows[self._due]
         # the plan goes on where the feet are
-        moved = np.subtract(toes(self._gauge, state.q), places).mean(axis=0)
-        self._com = com + moved
+        moved = self._gauge.toe(state.q) - (left + right) / 2
+        self._led_to = com + moved, *goal
         return self.torque(step * STEP_S, *state[:2], state.wrench[:, 2])
 
     def standing(self, time: float, foot_force: np.ndarray) -> np.ndarray:
@@ -107,13 +88,9 @@ class Tracker(LandingController):
         flat = self._stand == FLAT and felt.any()
         return felt if flat else np.ones(2, bool)
 
-    def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Wished CoM acceleration (3,) and rate of angular momentum (3,), those of the tape."""
-        body = self.body
-        rate = self._com_rate
-        wish = rate**2 * (self._com - body.com) + 2 * rate * (self._speed - body.com_velocity)
-        missing = self._momentum - body.momentum
-        return self._push + wish, self._twist + self.gains.momentum_rate * missing
+    def _goal(self, time: float, foot_middle: np.ndarray) -> Sequence[np.ndarray]:
+        """As of every landing controller, (3,) each; those of the tape."""
+        return self._led_to
 
     def _trunk_wish(self, v: np.ndarray) -> np.ndarray:
         """Angular acceleration (3,) of the trunk in its own axes, towards the tape's attitude."""
@@ -253,8 +230,8 @@ class Rebounds:
         """The feet leave: angles (nv - 6,) of joints off the tape [rad] fade in the air."""
         self._since = None
         lasts = FADE_SHARE * (next(end for end in self._ends if end > step) - step)
-        off = state.q[7:] - self.tracker.q[step, 7:]
-        rates = state.v[6:] - self.tracker.v[step, 6:]
+        off = state.q[7:] - self._playback.q[step, 7:]
+        rates = state.v[6:] - self._playback.v[step, 6:]
         t = np.array([step, step + lasts]) * STEP_S
         still = np.zeros_like(off)
         self._playback.add(CubicHermiteSpline(t, np.array([off, still]), np.array([rates, still])))
