@@ -124,15 +124,10 @@ class LandingController:
         self._loaded_n = max(body.size.of(CONTACT_FORCE_N, "N"), LIKELY * force_noise_n)
         g = self.gains
         self._com_rate = np.array([g.com_rate_xy, g.com_rate_xy, g.com_rate_z])
-        # of a foot that is in the air, or stands
-        self._foot_weights = np.repeat(
-            [
-                [g.swing_weight, g.swing_turning_weight],
-                [g.foot_weight, g.foot_turning_weight],
-            ],
-            3,
-            axis=1,
-        )
+        # by side: of a foot that is in the air, and of one that stands or steps
+        swings = g.swing_weight, g.swing_turning_weight
+        stands = g.foot_weight, g.foot_turning_weight
+        self._foot_weights = np.tile(np.repeat([swings, stands], 3, axis=1), (2, 1, 1))
         pitching = np.isin(robot.joint_names, [name for name, _, _ in robot.role_signs()])
         arms = np.isin(robot.joint_names, robot.joints["shoulder_pitch"])
         legs_weight = np.where(pitching, g.leg_posture_weight, g.lateral_posture_weight)
@@ -230,19 +225,15 @@ class LandingController:
         qp.cost("trunk", body.unknowns[3:6], self._trunk_wish(v), g.trunk_weight)
         for side in (0, 1):
             wish = self._foot_wish(side, contact[side])
-            steps = side == self.step.side
-            if steps:
+            weight = self._foot_weights[side, int(contact[side])]
+            if side == self.step.side:
                 wish[:3] = within(self.step.foot_acceleration(time, body), MAX_STEP)
+                weight = self._foot_weights[side, 1]
             target = wish - body.sole_drift[side]
-            weight = self._foot_weight(side, bool(steps or contact[side]))
             qp.cost(f"foot {side}", body.sole_rows[side], target, weight)
         qp.cost("posture", body.unknowns[6:-12], *self.posture_wish(q, v))
         qp.cost("effort", self._effort_rows, 0.0, self._effort_weight)
         return qp
-
-    def _foot_weight(self, side: int, stands: bool) -> np.ndarray:
-        """Weights (6,) of a foot that ``stands``, or steps, or is in the air."""
-        return self._foot_weights[int(stands)]
 
     def _lower_m(self) -> float:
         """By how much hips are lower over feet that stand further apart than in the stance, on legs
