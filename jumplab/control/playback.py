@@ -85,8 +85,7 @@ class Playback:
 
     def stands(self, step: float) -> Stand:
         """Contact of the left and of the right foot by the plan."""
-        left, right = self._stands[min(max(int(step), 0), self.steps)].tolist()
-        return left, right
+        return tuple(self._stands[min(max(int(step), 0), self.steps)].tolist())
 
     def command(
         self,
@@ -103,7 +102,6 @@ class Playback:
         the step, and ``1 + pace`` times as fast.
         """
         due = step + self.lead + shift_s / STEP_S
-        q, v = self._arriving(due, q, v)
         at = min(max(due, 0.0), float(self.steps))
         row = between(self._rows, at)
         angles, rate, tau, change = row[: 4 * self._n].reshape(4, -1)
@@ -116,7 +114,7 @@ class Playback:
             change=change,
             feet=self.stands(at),
             wrench=row[4 * self._n :].reshape(2, 6),
-            state=(q, v),
+            state=self._arriving(due, q, v),
         )
 
     def approach(self, q: np.ndarray) -> None:
@@ -181,7 +179,7 @@ def check_tape(tape: Tape, robot: Robot) -> None:
 def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Rows (n, ...) at times ``grid`` (n,) [s] of ``rows`` (N, ...) at times ``t`` (N,) [s]."""
     columns = [np.interp(grid, t, column) for column in rows.reshape(len(t), -1).T]
-    return np.stack(columns, axis=1).reshape(len(grid), *rows.shape[1:])
+    return np.transpose(columns).reshape(len(grid), *rows.shape[1:])
 
 
 def between(rows: np.ndarray, at: float) -> np.ndarray:
