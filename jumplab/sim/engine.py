@@ -6,8 +6,9 @@ and passes ``test_sim_world.py``; all else knows no engine.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -63,7 +64,7 @@ class Kept(NamedTuple):
         return float(sum(link.mass for link in self.inertials.values()))
 
 
-class Engine(ABC):
+class Engine(AbstractContextManager):
     """A robot in a scene, advanced in steps of :data:`jumplab.sim.STEP_S`; a context manager.
 
     Outside of an engine everything is Pinocchio's: ``q`` and ``v`` of the base *link* frame, joints
@@ -117,9 +118,6 @@ class Engine(ABC):
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Engine:
-        return self
 
     def __exit__(self, *exc) -> None:
         self.close()
