@@ -88,9 +88,7 @@ class Flight:
         # about the CoM in trunk axes: inertia, and momentum of the joints' rates alone
         level = np.hstack([np.tile(LEVEL, (len(q), 1)), q[:, 7:]])
         rates = tape.v[flight] * (np.arange(robot.model.nv) >= 6)
-        rows = [gauge.motion(*row) for row in zip(level, rates, strict=True)]
-        self._inertias = np.array([row.inertia for row in rows])
-        self._momenta = np.array([row.momentum for row in rows])
+        _, _, _, self._momenta, self._inertias = gauge.motions(level, rates)
         late = self._t >= self.from_s
         self.tight_s = float(self._t[late][np.argmin(self._inertias[late, 1, 1])])
         # a tuck that waits shall still open within the speed limits of the joints

@@ -165,3 +165,7 @@ class Gauge:
         momentum = data.hg
         velocity = momentum.linear / self.robot.total_mass
         return Motion(q, data.com[0].copy(), velocity, momentum.angular.copy(), data.Ig.inertia)
+
+    def motions(self, q: np.ndarray, v: np.ndarray) -> Motion:
+        """Motions in states ``q`` (N, nq) and ``v`` (N, nv), a row of each quantity for each."""
+        return Motion(*map(np.array, zip(*map(self.motion, q, v), strict=True)))

@@ -176,16 +176,11 @@ def _momentum_unexplained(result: SimulationResult) -> np.ndarray:
     """Force, and moment about the world's origin, (N - 1, 6) that momentum says and the ground does
     not.
     """
-    robot = result.robot
-    model = robot.model
-    data = model.createData()
-    weight = robot.total_mass * model.gravity.linear
-    rows = []
-    for state in zip(result.q, result.v, strict=True):
-        momentum = pin.computeCentroidalMomentum(model, data, *state).vector
-        rows.append((data.com[0].copy(), momentum[:3], momentum[3:]))
-    com, linear, spin = np.array(rows).swapaxes(0, 1)
-    spin = spin + np.cross(com, linear)
+    mass = result.robot.total_mass
+    weight = mass * result.robot.model.gravity.linear
+    _, com, velocity, momentum, _ = result.motion
+    linear = mass * velocity
+    spin = momentum + np.cross(com, linear)
     pushes, arm = _pushes(result)
     pushed = result.q[:, :3] + rotations(result.q[:, 3:7]) @ arm
     forces = result.foot_wrench[:, :, :3]

@@ -16,7 +16,7 @@ import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.control import STAND_S
-from jumplab.control.kinematics import Gauge, about_vertical, pitch_of
+from jumplab.control.kinematics import Gauge, Motion, about_vertical, pitch_of
 from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io.columns import Named
 from jumplab.io.folder import read_json, write_file
@@ -174,6 +174,11 @@ class SimulationResult(Shown, Named):
         return Gauge(self.robot).feet(self.q)
 
     @cached_property
+    def motion(self) -> Motion:
+        """Place and motion of the robot as a whole, (N, ...) each."""
+        return Gauge(self.robot).motions(self.q, self.v)
+
+    @cached_property
     def stray(self) -> np.ndarray:
         """(N, links) whether a link touches the ground, but for the feet, which shall."""
         return self.touching & ~np.isin(self.link_names, self.robot.foot.frames)
@@ -296,7 +301,7 @@ def record(
         phase[liftoff:touchdown] = "flight"
     if len(flown) == flights and flown[-1][1] is not None:
         phase[flown[-1][1] :] = "landing"
-    _, com, velocity, momentum, inertia = map(np.array, zip(*map(gauge.motion, q, v), strict=True))
+    motion = gauge.motions(q, v)
     log = dict(
         t=np.arange(len(q)) * STEP_S,
         q=q,
@@ -304,10 +309,10 @@ def record(
         tau=tau,
         foot_wrench=wrench,
         phase=phase,
-        com=com,
-        com_velocity=velocity,
-        L=momentum[:, 1],
-        rho=inertia[:, 1, 1],
+        com=motion.com,
+        com_velocity=motion.velocity,
+        L=motion.momentum[:, 1],
+        rho=motion.inertia[:, 1, 1],
         touching=touching,
         colliding=colliding,
     )
@@ -315,6 +320,7 @@ def record(
         array.setflags(write=False)
     names = dict(link_names=links, joint_names=robot.joint_names)
     run = SimulationResult(**log, **names, metrics=None, settings=settings or {}, robot=robot)
+    vars(run)["motion"] = motion  # known already
     jump = _Jump(run, gauge, goal, flown, flights, list(lands))
     standing_s, landed, reason = jump.verdict(higher_m)
     metrics = Metrics(
