@@ -37,7 +37,7 @@ class Log(NamedTuple):
     v: np.ndarray  # (n, nv)
     tau: np.ndarray  # (n, nv - 6) of the motors [N m]
     # (n, 2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
-    wrench: np.ndarray
+    foot_wrench: np.ndarray
     touching: np.ndarray  # (n, links) which links press on the ground
     colliding: np.ndarray  # (n,) whether links of the robot press on each other
 

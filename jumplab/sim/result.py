@@ -291,7 +291,7 @@ def record(
     feet ``lands`` (0 left, 1 right); ``solves`` are QPs posed and failed, ``steps_s`` times of
     recovery steps. Raises :class:`SolverError` if the engine's numbers have exploded.
     """
-    q, v, tau, wrench, touching, colliding = steps
+    q, v, _, wrench, *_ = steps
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise SolverError("the engine lost the robot: its state is not finite", stage="simulation")
     gauge = Gauge(robot)
@@ -303,18 +303,13 @@ def record(
         phase[flown[-1][1] :] = "landing"
     motion = gauge.motions(q, v)
     log = dict(
+        **steps._asdict(),
         t=np.arange(len(q)) * STEP_S,
-        q=q,
-        v=v,
-        tau=tau,
-        foot_wrench=wrench,
         phase=phase,
         com=motion.com,
         com_velocity=motion.velocity,
         L=motion.momentum[:, 1],
         rho=motion.inertia[:, 1, 1],
-        touching=touching,
-        colliding=colliding,
     )
     for array in log.values():
         array.setflags(write=False)
