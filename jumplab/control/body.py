@@ -4,13 +4,17 @@ rows that any choice of them has to obey.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from operator import attrgetter
+
 import numpy as np
 import pinocchio as pin
 
 from jumplab.control.kinematics import rotation
+from jumplab.io.tape import AIR, FLAT, TOE
 from jumplab.ocp.qp import Qp, QpSolver
 from jumplab.robot import Robot
-from jumplab.robot.contact import on_feet, point_motion, wrench_rows
+from jumplab.robot.contact import Anchor, on_feet, point_motion, wrench_rows
 from jumplab.robot.legs import size
 
 PERIOD_STEPS = 2  # 500 Hz
@@ -18,6 +22,8 @@ WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns a
 # [kg m^2] pitch inertia of the landed robot, turns a momentum rate into rad/s^2
 NOMINAL_INERTIA = 5.0
 AXES = np.arange(3)
+PITCH = 4  # row of a foot's twist that is free on its toe
+SEEN = attrgetter("place", "turn", "velocity", "drift", "jacobian")  # of a foot's motion
 SPIN_FRICTION = 0.04  # [m] friction coefficient times the mean lever of the sole, about 0.07 m
 SPIN_HALF_WIDTH_M = 0.05  # of that sole: narrow ones turn on their edges under less
 REST_S = 0.01  # in which a joint comes to rest on its stop
@@ -63,7 +69,7 @@ class WholeBody:
         self.momentum_rows = np.zeros((3, self.nx))
         self._dynamics = np.zeros((self.nv, self.nx))
 
-    def update(self, q: np.ndarray, v: np.ndarray, anchors: list | None = None) -> None:
+    def update(self, q: np.ndarray, v: np.ndarray, anchors: Sequence[Anchor] | None = None) -> None:
         """Evaluate everything at ``q`` (nq,) and ``v`` (nv,), before :meth:`set_contact`; with the
         wrenches at other ``anchors`` of both feet than the soles' middles.
         """
@@ -77,12 +83,11 @@ class WholeBody:
         self.trunk = data.oMi[1].rotation.copy()
         self._dynamics[:, : self.nv] = data.M
         self._offset = data.nle.copy()
-        feet = [point_motion(model, data, anchor) for anchor in anchors or self._middles]
-        self.soles = np.array([foot.place for foot in feet])
-        self.attitudes = np.array([foot.turn for foot in feet])
-        self.twists = np.array([foot.velocity for foot in feet])
-        self.sole_drift = np.array([foot.drift for foot in feet])
-        self.sole_rows[:, :, : self.nv] = [foot.jacobian for foot in feet]
+        feet = [SEEN(point_motion(model, data, anchor)) for anchor in anchors or self._middles]
+        self.soles, self.attitudes, self.twists, self.sole_drift, jacobians = map(
+            np.array, zip(*feet, strict=True)
+        )
+        self.sole_rows[:, :, : self.nv] = jacobians
 
     def set_contact(self, contact: np.ndarray) -> None:
         """Let only the feet flagged in ``contact`` (2,) transmit wrenches."""
@@ -130,6 +135,15 @@ class WholeBody:
         rows = self.momentum_rows / self._inertia
         qp.cost("momentum", rows, momentum / self._inertia, weights[1])
 
+    def com_wish(
+        self, com: np.ndarray, speed: np.ndarray, push: np.ndarray, rate: np.ndarray | float
+    ) -> np.ndarray:
+        """Acceleration (3,) of the CoM [m/s^2], towards a planned place ``com`` (3,), its ``speed``
+        (3,) and the rate ``push`` (3,) of that, by a critically damped ``rate`` [rad/s].
+        """
+        off = rate**2 * (com - self.com) + 2 * rate * (speed - self.com_velocity)
+        return push + off
+
     def trunk_wish(
         self, v: np.ndarray, q: np.ndarray, speed: np.ndarray, gained: np.ndarray, rate: float
     ) -> np.ndarray:
@@ -172,3 +186,23 @@ def corner_rows(robot: Robot, friction: float, length: float, width: float) -> n
     inside = friction / np.sqrt(2)  # a pyramid within the cone
     one = np.array([*wrench_rows(inside, half, half, width * foot.half_width, spin).values()])
     return np.hstack([np.zeros((2 * len(one), robot.model.nv)), np.kron(np.eye(2), one)])
+
+
+class Footing:
+    """Points on which wrenches act, and rows of the ground, by how feet stand: flat with the CoP
+    within these shares of the sole, or on the toe; those in the air as flat ones.
+    """
+
+    def __init__(self, robot: Robot, friction: float, length: float, width: float):
+        flat = robot.foot.center, length, width
+        ways = {AIR: flat, TOE: (robot.foot.tip, 0.0, 1.0), FLAT: flat}
+        self._feet = {}
+        for way, (point, *shares) in ways.items():
+            corners = np.split(corner_rows(robot, friction, *shares), 2)
+            self._feet[way] = list(zip(on_feet(robot, point), corners, strict=True))
+
+    def of(self, stand: tuple[int, int]) -> tuple[Sequence[Anchor], np.ndarray]:
+        """Anchors of both feet, and corner rows (k, nx), where they ``stand`` so."""
+        feet = [self._feet[way][side] for side, way in enumerate(stand)]
+        anchors, corners = zip(*feet, strict=True)
+        return anchors, np.vstack(corners)

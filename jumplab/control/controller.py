@@ -101,7 +101,7 @@ class Controller:
     touchdown : step in which the feet come down that end the schedule, and the landing begins;
         None until then.
     ahead : what the landing controller follows, and why.
-    rebounds : flights before the last one, see :class:`.rebound.Rebounds`; None if there are none.
+    rebounds : flights before the last one, see :class:`.rebound.Rebounds`.
     """
 
     @checked
@@ -159,24 +159,19 @@ class Controller:
         self._touches_n = max(touches_n, SURE * np.sqrt(2) * hardware.force_noise_n)
         earlier = passages(robot, tape, tape.flights[: -1 if flies else None], ground, reaim)
         limits = self._touches_n, hardware.force_noise_n
-        self.rebounds = Rebounds(robot, tape, self.playback, earlier, *limits) if earlier else None
+        self.rebounds = Rebounds(robot, tape, self.playback, earlier, *limits)
         self._looks_from = round(_looks_from_s(tape, self._awaited) / STEP_S)
-
-    @property
-    def _late(self) -> int:
-        """Steps by which the robot is behind the tape."""
-        return 0 if self.rebounds is None else self.rebounds.late
 
     @property
     def last_step(self) -> int:
         """Step at which a robot that is still in the air is given up."""
-        return self.playback.steps + self._late + round(WAIT_S / STEP_S)
+        return self.playback.steps + self.rebounds.late + round(WAIT_S / STEP_S)
 
     @property
     def solves(self) -> tuple[int, int]:
         """QPs posed in torque mode, and how many of them failed."""
-        used = [self.landing] + ([] if self.rebounds is None else [self.rebounds.tracker])
-        return sum(x.solver.solves for x in used), sum(x.solver.failures for x in used)
+        used = self.landing.solver, self.rebounds.solver
+        return sum(x.solves for x in used), sum(x.failures for x in used)
 
     @property
     def steps_s(self) -> tuple[float, ...]:
@@ -222,25 +217,26 @@ class Controller:
 
     def command(self, step: int, state: State) -> Command:
         """Command to the joints at ``step``, from the state as it is seen along the heading of the
-        landing.
+        landing; after touchdown, the landing controller's torque.
         """
         if step == 0 and self._at_rest:
             self.playback.approach(state.q)
             if self.feedback is not None:
                 self.feedback.begin(state.q)
         if self.touchdown is None:
-            at = step - self._late
-            if at < self._looks_from:
-                return self._play(step, state)
-            if not self._touches(at, state):
-                return self._play(step, state) if self.forecast is None else self._fly(at, state)
+            at = step - self.rebounds.late
+            if at < self._looks_from or not self._touches(at, state):
+                flies = self.forecast is not None and at >= self._looks_from
+                return self._fly(at, state) if flies else self._play(step, state)
             state = self._touch(step, state)
-        return self._land(step - self.touchdown, state)
+        since = (step - self.touchdown) * STEP_S
+        self._tau = self.landing.torque(since, *state[:2], state.wrench[:, 2])
+        return Command(tau=self._tau)
 
     def _play(self, step: int, state: State) -> Command:
         """Before the last flight is under way."""
-        command = None if self.rebounds is None else self.rebounds.command(step, state)
-        at = step - self._late
+        command = self.rebounds.command(step, state)
+        at = step - self.rebounds.late
         if command is None:
             command = self.playback.command(at, *state[:2])
         if self.feedback is None or command.q is None:
@@ -265,12 +261,6 @@ class Controller:
             aimed = self._reaim.correction(now, turn, left)
         command = self.playback.command(step, q, v, aimed, *shift)
         return replace(command, share=YIELD_SHARE) if left <= self._yield_s else command
-
-    def _land(self, since: int, state: State) -> Command:
-        """The landing controller's torque, ``since`` touchdown in steps."""
-        if self._decides(since):
-            self._tau = self.landing.torque(since * STEP_S, *state[:2], state.wrench[:, 2])
-        return Command(tau=self._tau)
 
     def _decides(self, since: int) -> bool:
         """Whether the landing controller poses a QP ``since`` touchdown in steps."""
@@ -305,16 +295,11 @@ def _hindrance(tape: Tape, gauge: Gauge, flies: bool) -> str | None:
     """Reason for which stage 1's landing cannot be followed; None if it can be."""
     if not flies:
         return "a robot that stands on one foot does not fall onto the other"
-    turned = _turned_rad(tape, gauge)
+    headings = np.unwrap([gauge.heading(q) for q in tape.q[tape.flights[-1]]])
+    turned = abs(headings[-1] - headings[0])
     if turned < TURNS_RAD:
         return None
     return f"stage 1 knows no landing after a turn by {np.degrees(turned):.0f} degrees"
-
-
-def _turned_rad(tape: Tape, gauge: Gauge) -> float:
-    """Angle by which a tape turns the feet about the vertical in its last flight [rad]."""
-    headings = np.unwrap([gauge.heading(q) for q in tape.q[tape.flights[-1]]])
-    return float(abs(headings[-1] - headings[0]))
 
 
 def _looks_from_s(tape: Tape, awaited: np.ndarray) -> float:

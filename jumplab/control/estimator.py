@@ -129,9 +129,7 @@ class Estimator:
         large = size(robot)
         self._tipped_m = large.of(TIPPED_M, "m")
         self._settle_s = large.of(SETTLE_S, "s")
-        self._leg = (n.joint_rad * large.of(LEG_M, "m")) ** 2 * np.eye(
-            3
-        )  # variance of a foot's place
+        self._leg = (n.joint_rad * large.of(LEG_M, "m")) ** 2 * UNIT  # variance of a foot's place
         self._loaded_n = max(large.of(LOADED_N, "N"), SURE * n.force)
         spread = np.repeat([n.tilt_rad, 1e-3, 1e-3, n.gyro_bias, n.accel_bias, 1e-3, 1e-3], 3)
         self._cov = np.diag(spread**2)

@@ -88,12 +88,14 @@ class Flight:
         # about the CoM in trunk axes: inertia, and momentum of the joints' rates alone
         level = np.hstack([np.tile(LEVEL, (len(q), 1)), q[:, 7:]])
         rates = tape.v[flight] * (np.arange(robot.model.nv) >= 6)
-        rows = [gauge.motion(*row) for row in zip(level, rates, strict=True)]
-        self._inertias = np.array([row.inertia for row in rows])
-        self._momenta = np.array([row.momentum for row in rows])
+        _, _, _, self._momenta, self._inertias = gauge.motions(level, rates)
         late = self._t >= self.from_s
         self.tight_s = float(self._t[late][np.argmin(self._inertias[late, 1, 1])])
-        self.later_s = self._longest_wait(robot, rates[self._t >= self.tight_s, 6:])
+        # a tuck that waits shall still open within the speed limits of the joints
+        opening = np.abs(rates[self._t >= self.tight_s, 6:])
+        faster = float((robot.limits.speed / np.maximum(opening, NOTHING)).min())
+        opens = self.end_s - self.tight_s
+        self.later_s = max(min(LATER_S, opens / 2), opens * (1 - 1 / max(faster, 1.0)))
         self.sooner_s = min(SOONER_S, FORWARD * (self.end_s - self.from_s) / STEEP)
         self._size = 0.0
         self._shift = 0.0
@@ -135,14 +137,6 @@ class Flight:
         speed = back @ now.velocity - [0.0, 0.0, self._gravity * left_s]
         rates[:3] += attitude.T @ (speed - self._gauge.motion(end, rates).velocity)
         return end, rates
-
-    def _longest_wait(self, robot: Robot, rates: np.ndarray) -> float:
-        """Longest time [s] that the tuck may wait, and still open within the speed limits of the
-        joints, whose ``rates`` (N, nv - 6) are those of the tape.
-        """
-        faster = robot.limits.speed / np.maximum(np.abs(rates), NOTHING)
-        opens = self.end_s - self.tight_s
-        return max(min(LATER_S, opens / 2), opens * (1 - 1 / max(float(faster.min()), 1.0)))
 
     def shift(self, step: int, now: Motion, left_s: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step,
@@ -193,17 +187,14 @@ class Flight:
 
     def _best(self, t: float, left_s: float, momentum: float, need: float) -> float:
         """The shift with which the trunk turns by ``need`` [rad], or the nearest one."""
-        low = -self.later_s
-        high = self.sooner_s
-        first, last = (self.trunk_turn(size, t, left_s, momentum) for size in (low, high))
+        ends = [-self.later_s, self.sooner_s]
+        first, last = (self.trunk_turn(size, t, left_s, momentum) for size in ends)
         way = np.sign(first - last)
         for _ in range(BISECTIONS):
-            middle = (low + high) / 2
-            if way * (self.trunk_turn(middle, t, left_s, momentum) - need) > 0:
-                low = middle
-            else:
-                high = middle
-        return (low + high) / 2
+            middle = sum(ends) / 2
+            more = way * (self.trunk_turn(middle, t, left_s, momentum) - need) > 0
+            ends[0 if more else 1] = middle
+        return sum(ends) / 2
 
     def place(
         self, size: float, t: float | np.ndarray, now: float, left_s: float

@@ -130,13 +130,17 @@ class Gauge:
                 there[side] = self.data.oMi[foot.joint].homogeneous
         return joints @ np.array([foot.placement.homogeneous for foot in self._feet])
 
+    def points(self, q: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Places (2, 3) of a ``point`` (3,) of each foot's frame in ``q`` (nq,) [m]."""
+        return np.array([foot.act(point) for foot in self.places(q)])
+
     def soles(self, q: np.ndarray) -> np.ndarray:
         """Mean of both soles' middles (3,) in ``q`` (nq,) [m]."""
-        return np.mean([foot.act(self.robot.foot.center) for foot in self.places(q)], axis=0)
+        return self.points(q, self.robot.foot.center).mean(axis=0)
 
     def toe(self, q: np.ndarray) -> np.ndarray:
         """Middle between the toes (3,) in ``q`` (nq,) [m]."""
-        return np.mean([foot.act(self.robot.foot.tip) for foot in self.places(q)], axis=0)
+        return self.points(q, self.robot.foot.tip).mean(axis=0)
 
     def corners(self, q: np.ndarray) -> np.ndarray:
         """Corners (8, 3) of both soles in ``q`` (nq,) [m]."""
@@ -161,3 +165,7 @@ class Gauge:
         momentum = data.hg
         velocity = momentum.linear / self.robot.total_mass
         return Motion(q, data.com[0].copy(), velocity, momentum.angular.copy(), data.Ig.inertia)
+
+    def motions(self, q: np.ndarray, v: np.ndarray) -> Motion:
+        """Motions in states ``q`` (N, nq) and ``v`` (N, nv), a row of each quantity for each."""
+        return Motion(*map(np.array, zip(*map(self.motion, q, v), strict=True)))

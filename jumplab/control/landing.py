@@ -8,6 +8,7 @@ wishes: CoM, angular momentum, trunk, feet flat and still, posture.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from jumplab.control.kinematics import Gauge
 from jumplab.control.step import RecoveryStep
 from jumplab.ocp.qp import Qp
 from jumplab.robot import Robot
+from jumplab.robot.contact import Anchor
 from jumplab.robot.stance import leg_length, stance_configuration
 from jumplab.stages.srmp.landing import LandingPlan
 
@@ -122,15 +124,10 @@ class LandingController:
         self._loaded_n = max(body.size.of(CONTACT_FORCE_N, "N"), LIKELY * force_noise_n)
         g = self.gains
         self._com_rate = np.array([g.com_rate_xy, g.com_rate_xy, g.com_rate_z])
-        # of a foot that is in the air, or stands
-        self._foot_weights = np.repeat(
-            [
-                [g.swing_weight, g.swing_turning_weight],
-                [g.foot_weight, g.foot_turning_weight],
-            ],
-            3,
-            axis=1,
-        )
+        # by side: of a foot that is in the air, and of one that stands or steps
+        swings = g.swing_weight, g.swing_turning_weight
+        stands = g.foot_weight, g.foot_turning_weight
+        self._foot_weights = np.tile(np.repeat([swings, stands], 3, axis=1), (2, 1, 1))
         pitching = np.isin(robot.joint_names, [name for name, _, _ in robot.role_signs()])
         arms = np.isin(robot.joint_names, robot.joints["shoulder_pitch"])
         legs_weight = np.where(pitching, g.leg_posture_weight, g.lateral_posture_weight)
@@ -145,7 +142,9 @@ class LandingController:
         self._effort_rows = np.vstack([body.unknowns, left - right])
         weights = (g.acceleration_weight, g.wrench_weight, g.uneven_weight)
         self._effort_weight = np.repeat(weights, [body.nv, 12, 6])
-        self._anchors: list | None = None  # where wrenches act, if not at the soles' middles
+        self._anchors: Sequence[Anchor] | None = (
+            None  # where wrenches act, if not at the soles' middles
+        )
         rest = stance_configuration(robot)
         # posture to go to, and its rates and accelerations
         self._rest = rest[7:]
@@ -155,7 +154,7 @@ class LandingController:
         gauge = Gauge(robot)
         self._height = float(gauge.com(rest)[2])  # above the soles
         self._leg_m = leg_length(robot)
-        left, right = (foot.act(robot.foot.center)[:2] for foot in gauge.places(rest))
+        left, right = gauge.points(rest, robot.foot.center)[:, :2]
         self._apart_m = float(np.linalg.norm(left - right))
         self.reference = reference
 
@@ -215,7 +214,9 @@ class LandingController:
         middle = ground.mean(axis=0)
         if contact.all():
             middle[2] -= self._lower_m()
-        com_wish, momentum_wish = self._balance(time, middle)
+        *com, momentum, twist = self._goal(time, middle)
+        com_wish = body.com_wish(*com, self._com_rate)
+        momentum_wish = twist + g.momentum_rate * (momentum - body.momentum)
         if self.step.side is not None:
             com_wish[:2] = self.step.com_acceleration(body)
         on = float(contact.any())  # in the air neither CoM nor momentum can be asked for
@@ -224,19 +225,15 @@ class LandingController:
         qp.cost("trunk", body.unknowns[3:6], self._trunk_wish(v), g.trunk_weight)
         for side in (0, 1):
             wish = self._foot_wish(side, contact[side])
-            steps = side == self.step.side
-            if steps:
+            weight = self._foot_weights[side, int(contact[side])]
+            if side == self.step.side:
                 wish[:3] = within(self.step.foot_acceleration(time, body), MAX_STEP)
+                weight = self._foot_weights[side, 1]
             target = wish - body.sole_drift[side]
-            weight = self._foot_weight(side, bool(steps or contact[side]))
             qp.cost(f"foot {side}", body.sole_rows[side], target, weight)
         qp.cost("posture", body.unknowns[6:-12], *self.posture_wish(q, v))
         qp.cost("effort", self._effort_rows, 0.0, self._effort_weight)
         return qp
-
-    def _foot_weight(self, side: int, stands: bool) -> np.ndarray:
-        """Weights (6,) of a foot that ``stands``, or steps, or is in the air."""
-        return self._foot_weights[int(stands)]
 
     def _lower_m(self) -> float:
         """By how much hips are lower over feet that stand further apart than in the stance, on legs
@@ -246,18 +243,17 @@ class LandingController:
         further = max(np.sum((left - right) ** 2) - self._apart_m**2, 0.0)
         return self._leg_m - np.sqrt(max(self._leg_m**2 - further / 4, 0.0))
 
-    def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Wished CoM acceleration (3,) and rate of angular momentum (3,)."""
-        body = self.body
-        rate = self._com_rate
+    def _goal(self, time: float, foot_middle: np.ndarray) -> Sequence[np.ndarray]:
+        """Place, velocity and acceleration of the CoM, angular momentum and its rate, (3,) each, to
+        which the robot is led.
+        """
         goal = foot_middle + np.array([0.0, 0.0, self._height])
         speed, momentum, push, twist = np.zeros((4, 3))
         if self.reference is not None:
             com, speed[[0, 2]], momentum[1] = self.reference.at(time)
             goal[[0, 2]] = foot_middle[[0, 2]] + com
             push[[0, 2]], twist[1] = self.reference.feed_forward(time)
-        wish = push + rate**2 * (goal - body.com) + 2 * rate * (speed - body.com_velocity)
-        return wish, twist + self.gains.momentum_rate * (momentum - body.momentum)
+        return goal, speed, push, momentum, twist
 
     def _trunk_wish(self, v: np.ndarray) -> np.ndarray:
         """Angular acceleration (3,) of the trunk in its own axes: upright in roll and pitch, yaw

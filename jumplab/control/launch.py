@@ -22,14 +22,14 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.control import STEP_S
-from jumplab.control.body import PERIOD_STEPS, WholeBody, corner_rows, solver
+from jumplab.control.body import PERIOD_STEPS, PITCH, Footing, WholeBody, solver
 from jumplab.control.kinematics import Gauge, State, about_vertical
 from jumplab.control.playback import AIR, Command, Playback, Stand, resampled
 from jumplab.errors import InputError
 from jumplab.io import tape as tapes
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.robot.contact import moving, on_feet, point_motion
+from jumplab.robot.contact import Anchor, moving, point_motion
 
 FRICTION = 0.6  # more than plans use, less than most floors have
 LENGTH_SHARE = 0.95  # of the sole for the CoP
@@ -79,11 +79,6 @@ def check_mode(mode: str) -> None:
         )
 
 
-def toes(gauge: Gauge, q: np.ndarray) -> list[np.ndarray]:
-    """Places (3,) of the left and the right toe [m]."""
-    return [foot.act(gauge.robot.foot.tip) for foot in gauge.places(q)]
-
-
 def balance_rows(robot: Robot, tape: Tape, steps: int) -> np.ndarray:
     """CoM, its velocity and acceleration, L, its rate, and the places of the left and the right toe
     (steps + 1, 7, 3) of a tape, on the grid of control.
@@ -96,7 +91,8 @@ def balance_rows(robot: Robot, tape: Tape, steps: int) -> np.ndarray:
         push = f[:, :3].sum(axis=0) / robot.total_mass + gravity
         arms = np.array([foot.translation for foot in gauge.places(q)]) - now.com
         moment = (f[:, 3:] + np.cross(arms, f[:, :3])).sum(axis=0)
-        rows.append([now.com, now.velocity, push, now.momentum, moment, *toes(gauge, q)])
+        toes = gauge.points(q, robot.foot.tip)
+        rows.append([now.com, now.velocity, push, now.momentum, moment, *toes])
     return resampled(np.arange(steps + 1) * STEP_S, tape.t, np.array(rows))
 
 
@@ -110,7 +106,7 @@ class LaunchFeedback:
     def __init__(self, robot: Robot, tape: Tape, playback: Playback):
         self._robot = robot
         self.playback = playback
-        self._body = WholeBody(robot)
+        self._body = body = WholeBody(robot)
         self._gauge = Gauge(robot)
         self.solver = solver()
         self._stand: Stand | None = None
@@ -118,16 +114,16 @@ class LaunchFeedback:
         self._unturned = 0.0
         self._speed = np.zeros(3)  # of the feet that carry, filtered [m/s]
         air_s = [np.ptp(tape.t[rows]) for rows in tape.flights]
-        size = self._body.size
-        rates = COM_RATE, MOMENTUM_RATE, PITCH_RATE, POSTURE_RATE, FADE_RATE
-        self._com_rate, self._momentum_rate, self._pitch_rate, self._posture_rate, fade_rate = (
-            size.of(x, "rad/s") for x in rates
+        rates = COM_RATE, MOMENTUM_RATE, PITCH_RATE, POSTURE_RATE, SWING_RATE, TRUNK_RATE, FADE_RATE
+        *self._lead_rates, self._posture_rate, self._swing_rate, self._trunk_rate, fade_rate = (
+            body.size.of(x, "rad/s") for x in rates
         )
-        self._swing_rate = size.of(SWING_RATE, "rad/s")
-        self._trunk_rate = size.of(TRUNK_RATE, "rad/s")
-        self._turning = size.of(1.0, "s") ** 4  # on weights of angular accelerations
-        turning = self._turning * SWING_TURNING_WEIGHT
-        self._swing_weight = np.repeat([SWING_WEIGHT, turning], 3)
+        self._turning = body.size.of(1.0, "s") ** 4  # on weights of angular accelerations
+        self._foot_weights = {
+            tapes.AIR: np.repeat([SWING_WEIGHT, self._turning * SWING_TURNING_WEIGHT], 3),
+            tapes.TOE: FOOT_WEIGHT * (np.arange(6) != PITCH),
+            tapes.FLAT: FOOT_WEIGHT,
+        }
         self._fade_rate = max([fade_rate, *(FADED / (FADE_SHARE * x) for x in air_s)])
         self._air_s = next(iter(air_s), np.inf)  # of the first flight
         # of the joints, off the tape
@@ -137,18 +133,7 @@ class LaunchFeedback:
         self._left = about_vertical(self._gauge.heading(tape.q[0]))[:, 1]
         self._first = tape.q[0]
         self.rows = balance_rows(robot, tape, playback.steps)
-        flat = robot.foot.center, LENGTH_SHARE
-        stands = {tapes.AIR: flat, tapes.TOE: (robot.foot.tip, 0.0), tapes.FLAT: flat}
-        self._stands = {
-            stand: (on_feet(robot, point), np.split(corner_rows(robot, FRICTION, share, 1.0), 2))
-            for stand, (point, share) in stands.items()
-        }
-        grid = np.arange(playback.steps + 1) * STEP_S
-        self._q = resampled(grid, tape.t, tape.q)
-        self._v = resampled(grid, tape.t, tape.v)
-
-    def _toes(self, q: np.ndarray) -> list[np.ndarray]:
-        return toes(self._gauge, q)
+        self._footing = Footing(robot, FRICTION, LENGTH_SHARE, 1.0)
 
     def to_json(self) -> dict:
         """Counts and deviations of the launch, for the settings of a result."""
@@ -206,44 +191,37 @@ class LaunchFeedback:
         """
         body = self._body
         carries = np.array(stand) > tapes.AIR
-        anchors, corners = zip(
-            *((self._stands[x][0][side], self._stands[x][1][side]) for side, x in enumerate(stand)),
-            strict=True,
-        )
+        anchors, corners = self._footing.of(stand)
         body.update(q, v, anchors)
         body.set_contact(carries)
         com, speed, push, momentum, spin, *toes = self.rows[due]
         # the plan goes on where the feet are, and ends where it would have
-        moved = [1.0, 1.0, 0.0] * np.subtract(self._toes(q), toes)[carries].mean(axis=0)
+        now = self._gauge.points(q, self._robot.foot.tip)
+        moved = [1.0, 1.0, 0.0] * (now - toes)[carries].mean(axis=0)
         com = com + moved
         if due < self.playback.lands:
             speed = speed - moved / self._air_s
-        shift = self._com_rate**2 * (com - body.com)
-        shift = shift + 2 * self._com_rate * (speed - body.com_velocity)
+        com_rate, momentum_rate, pitch_rate = self._lead_rates
+        push = body.com_wish(com, speed, push, com_rate)
         missing = momentum - body.momentum
-        turn = spin + self._momentum_rate * missing
-        rolls = tapes.TOE in stand
-        if rolls:
+        turn = spin + momentum_rate * missing
+        creep = np.zeros(6)
+        if tapes.TOE in stand:
+            creep = self._creep(stand, carries)
             pitching = float(self._left @ missing)
             self._unturned += PERIOD_STEPS * STEP_S * pitching
-            pitch_rate = self._pitch_rate
-            faster = (2 * pitch_rate - self._momentum_rate) * pitching
+            faster = (2 * pitch_rate - momentum_rate) * pitching
             turn = turn + (faster + pitch_rate**2 * self._unturned) * self._left
         tape = self.playback.acceleration(due)
         back = self._back(self._posture_rate)
-        qp = body.program(v, np.vstack(corners))
-        body.balance(qp, push + shift, turn, (COM_WEIGHT, self._turning * MOMENTUM_WEIGHT))
-        creep = self._creep(stand, carries) if rolls else np.zeros(6)
+        qp = body.program(v, corners)
+        body.balance(qp, push, turn, (COM_WEIGHT, self._turning * MOMENTUM_WEIGHT))
         for side, x in enumerate(stand):
-            weight = FOOT_WEIGHT * np.array([1.0, 1.0, 1.0, 1.0, float(x == tapes.FLAT), 1.0])
-            wish = creep
-            if x == tapes.AIR:
-                weight = self._swing_weight
-                wish = self._swing(due, side, moved)
-            qp.cost(f"foot {side}", body.sole_rows[side], wish - body.sole_drift[side], weight)
+            wish = self._swing(due, side, anchors[side], moved) if x == tapes.AIR else creep
+            target = wish - body.sole_drift[side]
+            qp.cost(f"foot {side}", body.sole_rows[side], target, self._foot_weights[x])
         if tapes.AIR in stand:
-            planned = self._q[due], self._v[due], self._gained(due)
-            wish = body.trunk_wish(v, *planned, self._trunk_rate)
+            wish = body.trunk_wish(v, *self.playback.planned(due), self._trunk_rate)
             qp.cost("trunk", body.unknowns[3:6], wish, self._turning * TRUNK_WEIGHT)
         posture = self._turning * POSTURE_WEIGHT
         qp.cost("posture", body.unknowns[6 : body.nv], tape + back, posture)
@@ -257,23 +235,19 @@ class LaunchFeedback:
         most = body.size.of(MOST, "rad/s^2")
         return np.clip(change, -most, most), tau
 
-    def _gained(self, step: int) -> np.ndarray:
-        """Acceleration (nv,) of the tape."""
-        now = min(step, len(self._v) - 2)
-        return (self._v[now + 1] - self._v[now]) / STEP_S
-
-    def _swing(self, due: int, side: int, moved: np.ndarray) -> np.ndarray:
+    def _swing(self, due: int, side: int, anchor: Anchor, moved: np.ndarray) -> np.ndarray:
         """Acceleration (6,) of the sole of a foot in the air, towards its motion by the plan, which
         goes on where the feet that carry are, ``moved`` (3,) [m].
         """
         body = self._body
         gauge = self._gauge
         rate = self._swing_rate
-        moving(gauge.model, gauge.data, self._q[due], self._v[due])
-        foot = point_motion(gauge.model, gauge.data, self._stands[tapes.AIR][0][side])
+        q, v, gained = self.playback.planned(due)
+        moving(gauge.model, gauge.data, q, v)
+        foot = point_motion(gauge.model, gauge.data, anchor)
         turned = pin.log3(foot.turn @ body.attitudes[side].T)
         off = np.concatenate([foot.place + moved - body.soles[side], turned])
-        gained = foot.jacobian @ self._gained(due) + foot.drift
+        gained = foot.jacobian @ gained + foot.drift
         return gained + rate**2 * off + 2 * rate * (foot.velocity - body.twists[side])
 
     def _creep(self, stand: Stand, carries: np.ndarray) -> np.ndarray:

@@ -53,6 +53,10 @@ class Playback:
     Commands that are known to arrive ``lead_s`` late are those of the tape so much later. The robot
     is expected to be as far off the tape then as it is measured to be now: the plan is sent ahead,
     errors are met late.
+
+    Attributes
+    ----------
+    q, v : (steps + 1, nq) and (steps + 1, nv), the tape on that grid, as it was planned.
     """
 
     def __init__(self, tape: Tape, robot: Robot, lead_s: float = 0.0):
@@ -62,13 +66,12 @@ class Playback:
         self._gauge = Gauge(robot)
         self._grid = np.arange(self.steps + 1) * STEP_S
         self._n = n = len(robot.joint_names)
-        q = resampled(self._grid, tape.t, tape.q)
-        self._v = resampled(self._grid, tape.t, tape.v)
-        tau = resampled(self._grid, tape.t, tape.tau)
+        self.q, self.v, tau, wrench = (
+            resampled(self._grid, tape.t, rows) for rows in (tape.q, tape.v, tape.tau, tape.f)
+        )
         change = np.diff(tau, axis=0, append=tau[-1:])
-        wrench = resampled(self._grid, tape.t, tape.f).reshape(-1, 12)
         # angles, rates, torques, their changes and wrenches side by side: one row is read at a time
-        self._rows = np.hstack([q[:, 7:], self._v[:, 6:], tau, change, wrench])
+        self._rows = np.hstack([self.q[:, 7:], self.v[:, 6:], tau, change, wrench.reshape(-1, 12)])
         self._q, self._rate, _, change = self._rows[:, : 4 * n].reshape(-1, 4, n).swapaxes(0, 1)
         last = np.searchsorted(tape.t, self._grid + STEP_S / 2, side="right") - 1
         self._stands = tape.contacts[last]
@@ -82,8 +85,7 @@ class Playback:
 
     def stands(self, step: float) -> Stand:
         """Contact of the left and of the right foot by the plan."""
-        left, right = self._stands[min(max(int(step), 0), self.steps)].tolist()
-        return left, right
+        return tuple(self._stands[min(max(int(step), 0), self.steps)].tolist())
 
     def command(
         self,
@@ -100,7 +102,6 @@ class Playback:
         the step, and ``1 + pace`` times as fast.
         """
         due = step + self.lead + shift_s / STEP_S
-        q, v = self._arriving(due, q, v)
         at = min(max(due, 0.0), float(self.steps))
         row = between(self._rows, at)
         angles, rate, tau, change = row[: 4 * self._n].reshape(4, -1)
@@ -113,7 +114,7 @@ class Playback:
             change=change,
             feet=self.stands(at),
             wrench=row[4 * self._n :].reshape(2, 6),
-            state=(q, v),
+            state=self._arriving(due, q, v),
         )
 
     def approach(self, q: np.ndarray) -> None:
@@ -147,6 +148,11 @@ class Playback:
         now = min(step, self.steps - 1)
         return (self._rate[now + 1] - self._rate[now]) / STEP_S
 
+    def planned(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """State (nq,), (nv,) and acceleration (nv,) of the tape as it was planned."""
+        now = min(step, self.steps - 1)
+        return self.q[step], self.v[step], (self.v[now + 1] - self.v[now]) / STEP_S
+
     def _arriving(self, at: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """State (q, v) in which a command of the tape's step ``at`` arrives, as far off the tape as
         now.
@@ -155,7 +161,7 @@ class Playback:
             return q, v
         due, now = (min(max(x, 0.0), self.steps) for x in (at, at - self.lead))
         moved = between(self._q, due) - between(self._q, now)
-        gained = between(self._v, due) - between(self._v, now)
+        gained = between(self.v, due) - between(self.v, now)
         base = self.lead * STEP_S * (v[:6] + gained[:6] / 2)
         return pin.integrate(self._gauge.model, q, np.concatenate([base, moved])), v + gained
 
@@ -173,7 +179,7 @@ def check_tape(tape: Tape, robot: Robot) -> None:
 def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Rows (n, ...) at times ``grid`` (n,) [s] of ``rows`` (N, ...) at times ``t`` (N,) [s]."""
     columns = [np.interp(grid, t, column) for column in rows.reshape(len(t), -1).T]
-    return np.stack(columns, axis=1).reshape(len(grid), *rows.shape[1:])
+    return np.transpose(columns).reshape(len(grid), *rows.shape[1:])
 
 
 def between(rows: np.ndarray, at: float) -> np.ndarray:

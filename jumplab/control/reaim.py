@@ -85,10 +85,9 @@ class Reaim:
         self._low, self._high = self._range(robot)
         self._far = False
         end = self._gauge.motion(tape.q[-1], tape.v[-1])
-        feet = self._gauge.places(self._end)
-        self._attitudes = [foot.rotation for foot in feet]
+        self._attitudes = [foot.rotation for foot in self._gauge.places(self._end)]
         # of the soles' middles, from the CoM
-        self._places = np.array([foot.act(robot.foot.center) - end.com for foot in feet])
+        self._places = self._gauge.points(self._end, robot.foot.center) - end.com
         self._middle = self._places.mean(axis=0)
         tipping = end.momentum / robot.total_mass - np.cross(self._middle, end.velocity)
         self._tipping = tipping[:2]

@@ -15,17 +15,16 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from jumplab.control import STEP_S
-from jumplab.control.body import PERIOD_STEPS, corner_rows
+from jumplab.control.body import PERIOD_STEPS, PITCH, Footing, solver
 from jumplab.control.flight import Flight
 from jumplab.control.kinematics import Gauge, State
-from jumplab.control.landing import GAINS, PLANNED_FRICTION, LandingController
-from jumplab.control.launch import FADE_SHARE, balance_rows, toes
-from jumplab.control.playback import AIR, FLAT, Command, Playback, resampled
+from jumplab.control.landing import GAINS, PLANNED_FRICTION, SOLE_SHARE, LandingController
+from jumplab.control.launch import FADE_SHARE, balance_rows
+from jumplab.control.playback import AIR, FLAT, Command, Playback
 from jumplab.control.reaim import Reaim
 from jumplab.io import tape as tapes
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.robot.contact import on_feet
 from jumplab.robot.legs import size
 
 # the next flight hangs on height, place and angular momentum at its start. Two bounds of four
@@ -43,29 +42,19 @@ TRACKING = replace(
 NEAR_S = 0.03
 # of soles to the axes of the last landing, in which the CoP's and the legs' rows are written
 ALONG_RAD = 0.3
-PITCH = 4  # of a foot's twist, free on its toe
 
 
 class Tracker(LandingController):
-    """Torques that lead the robot along the tape while its feet stand; ``q`` and ``v`` are the
-    tape's, on the grid of control.
-    """
+    """Torques that lead the robot along the tape while its feet stand."""
 
     def __init__(self, robot: Robot, tape: Tape, playback: Playback, force_noise_n: float):
         super().__init__(robot, force_noise_n=force_noise_n, gains=TRACKING)
         self._gauge = Gauge(robot)
         self._playback = playback
-        grid = np.arange(playback.steps + 1) * STEP_S
         self._rows = balance_rows(robot, tape, playback.steps)
-        self.q = resampled(grid, tape.t, tape.q)
-        self.v = resampled(grid, tape.t, tape.v)
         self._due = 0
-        flat = on_feet(robot, robot.foot.center), self._corners
-        toe = on_feet(robot, robot.foot.tip), corner_rows(robot, PLANNED_FRICTION, 0.0, 1.0)
-        self._stands = {
-            stand: (anchors, np.split(rows, 2))
-            for stand, (anchors, rows) in {tapes.FLAT: flat, tapes.TOE: toe}.items()
-        }
+        self._footing = Footing(robot, PLANNED_FRICTION, *SOLE_SHARE)
+        self._pitch_weights = self._foot_weights[..., PITCH].copy()
 
     def begin(self) -> None:
         """Feet come down once more, perhaps on other ground."""
@@ -81,22 +70,17 @@ class Tracker(LandingController):
         if self._playback.stands(due) != AIR:  # of a take-off that is due, the last contact
             self._due = due
         self._stand = self._playback.stands(self._due)
-        q, v = self.q[self._due], self.v[self._due]
+        self._planned = q, v, gained = self._playback.planned(self._due)
         self._rest = q[7:]
         self._rest_rates = v[6:]
-        gained = (self.v[self._due + 1] - v) / STEP_S
         self._rest_push = gained[6:]
-        self._planned = q, v, gained
-        parts = [
-            (self._stands[x][0][side], self._stands[x][1][side])
-            for side, x in enumerate(self._stand)
-        ]
-        self._anchors = [anchor for anchor, _ in parts]
-        self._corners = np.vstack([rows for _, rows in parts])
-        com, self._speed, self._push, self._momentum, self._twist, *places = self._rows[self._due]
+        self._anchors, self._corners = self._footing.of(self._stand)
+        on_toe = np.equal(self._stand, tapes.TOE)  # such a foot may pitch
+        self._foot_weights[..., PITCH] = np.where(on_toe[:, None], 0.0, self._pitch_weights)
+        com, *goal, left, right = self._rows[self._due]
         # the plan goes on where the feet are
-        moved = np.subtract(toes(self._gauge, state.q), places).mean(axis=0)
-        self._com = com + moved
+        moved = self._gauge.toe(state.q) - (left + right) / 2
+        self._led_to = com + moved, *goal
         return self.torque(step * STEP_S, *state[:2], state.wrench[:, 2])
 
     def standing(self, time: float, foot_force: np.ndarray) -> np.ndarray:
@@ -107,23 +91,13 @@ class Tracker(LandingController):
         flat = self._stand == FLAT and felt.any()
         return felt if flat else np.ones(2, bool)
 
-    def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Wished CoM acceleration (3,) and rate of angular momentum (3,), those of the tape."""
-        body = self.body
-        rate = self._com_rate
-        wish = rate**2 * (self._com - body.com) + 2 * rate * (self._speed - body.com_velocity)
-        missing = self._momentum - body.momentum
-        return self._push + wish, self._twist + self.gains.momentum_rate * missing
+    def _goal(self, time: float, foot_middle: np.ndarray) -> Sequence[np.ndarray]:
+        """As of every landing controller, (3,) each; those of the tape."""
+        return self._led_to
 
     def _trunk_wish(self, v: np.ndarray) -> np.ndarray:
         """Angular acceleration (3,) of the trunk in its own axes, towards the tape's attitude."""
         return self.body.trunk_wish(v, *self._planned, self.gains.trunk_rate)
-
-    def _foot_weight(self, side: int, stands: bool) -> np.ndarray:
-        """Weights (6,) of a foot; on its toe it may pitch."""
-        weight = super()._foot_weight(side, stands)
-        free = (np.arange(6) == PITCH) & (self._stand[side] == tapes.TOE)
-        return np.where(free, 0.0, weight)
 
 
 @dataclass
@@ -136,9 +110,10 @@ class Passage:
     reaim: Reaim | None
     near_s: float  # so long before a touchdown is due, its forecast is made no more
 
+    shift_s: float = 0.0  # by which the tape is read ahead
+
     def __post_init__(self):
         self._due_s = self.flight.end_s  # when its touchdown is due, on the tape's clock
-        self._shift_s = 0.0  # by which the tape is read ahead
 
     def command(self, step: int, state: State, gauge: Gauge, playback: Playback) -> Command:
         """Command at a ``step`` of the tape: the rest of it in the time that is left [s], the legs
@@ -153,11 +128,11 @@ class Passage:
         aimed = 0.0
         if self.reaim is not None:
             aimed = self.reaim.correction(now, self.flight.turn_ahead(step, now, left), left)
-        before = self._shift_s
+        before = self.shift_s
         at = float(self.flight.place(0.0, t, t, left))
-        self._shift_s = min(at, (self.end - 1) * STEP_S) - t
-        pace = (self._shift_s - before) / STEP_S
-        command = playback.command(step, *state[:2], aimed, self._shift_s, pace)
+        self.shift_s = min(at, (self.end - 1) * STEP_S) - t
+        pace = (self.shift_s - before) / STEP_S
+        command = playback.command(step, *state[:2], aimed, self.shift_s, pace)
         return replace(command, feet=AIR)  # also of a robot that comes down later than planned
 
     def may_end(self, step: int) -> bool:
@@ -177,9 +152,9 @@ def passages(
     starts = np.array([rows.start for rows in tape.flights] + [len(tape.t)])
     found = []
     for rows in flights:
-        leaves = starts[starts >= rows.stop][0]
-        both = (tape.contacts[rows.stop : leaves] > tapes.AIR).all()
-        flat = tuple(tape.contacts[rows.stop].tolist()) == FLAT
+        stands = tape.contacts[rows.stop : starts[starts >= rows.stop][0]]
+        both = (stands > tapes.AIR).all()
+        flat = (tape.contacts[rows.stop] == FLAT).all()
         if both and flat and abs(gauge.heading(tape.q[rows.stop])) < ALONG_RAD:
             part = tape.until(rows.stop)
             begin, end = (round(float(tape.t[row]) / STEP_S) for row in (rows.start, rows.stop))
@@ -189,12 +164,12 @@ def passages(
 
 
 class Rebounds:
-    """Commands from the first of some ``passages`` (at least one) of a tape to the take-off of its
-    last flight.
+    """Commands from the first of some ``passages`` of a tape to the take-off of its last flight.
 
     Attributes
     ----------
     late : steps by which the robot is behind the tape, which is read so much later.
+    solver : of the torques between the flights.
     """
 
     def __init__(
@@ -207,16 +182,17 @@ class Rebounds:
         force_noise_n: float,
     ):
         self.late = 0
-        self.tracker = Tracker(robot, tape, playback, force_noise_n)
+        self.solver = solver()
+        if passages:
+            self._tracker = Tracker(robot, tape, playback, force_noise_n)
+            self.solver = self._tracker.solver
         self._playback = playback
         self._gauge = Gauge(robot)
-        self._passages = list(passages)
-        self._first = passages[0].begin
+        self._passages = passages
         times = np.append(tape.t, tape.t[-1])
         self._ends = [round(float(times[rows.stop]) / STEP_S) for rows in tape.flights]
         self._touches_n = touches_n
         self._since: int | None = None  # the step in which the feet came down
-        self._tau = np.zeros(len(robot.joint_names))
         self._begun = False
 
     def command(self, step: int, state: State) -> Command | None:
@@ -226,7 +202,7 @@ class Rebounds:
         at = step - self.late
         if not self._begun:  # a run may begin later on the tape
             self._passages = [x for x in self._passages if x.end > at]
-        self._begun |= at >= self._first
+            self._begun = True
         if self._since is not None:
             if self._playback.stands(at) != AIR:
                 return self._lead(step, state)
@@ -240,21 +216,21 @@ class Rebounds:
         self._passages.pop(0)
         self.late += at - passage.end
         self._since = step
-        self.tracker.begin()
+        self._tracker.begin()
         return self._lead(step, state)
 
     def _lead(self, step: int, state: State) -> Command:
         """Torques (nv - 6,) [N m] of the tracker, held for some steps."""
         if (step - self._since) % PERIOD_STEPS == 0:
-            self._tau = self.tracker.lead(step - self.late, state)
+            self._tau = self._tracker.lead(step - self.late, state)
         return Command(tau=self._tau)
 
     def _leave(self, step: int, state: State) -> None:
         """The feet leave: angles (nv - 6,) of joints off the tape [rad] fade in the air."""
         self._since = None
         lasts = FADE_SHARE * (next(end for end in self._ends if end > step) - step)
-        off = state.q[7:] - self.tracker.q[step, 7:]
-        rates = state.v[6:] - self.tracker.v[step, 6:]
+        off = state.q[7:] - self._playback.q[step, 7:]
+        rates = state.v[6:] - self._playback.v[step, 6:]
         t = np.array([step, step + lasts]) * STEP_S
         still = np.zeros_like(off)
         self._playback.add(CubicHermiteSpline(t, np.array([off, still]), np.array([rates, still])))

@@ -136,10 +136,8 @@ class TorqueServo:
         self._data = robot.model.createData()
         role = {name: role for role, pair in robot.joints.items() for name in pair}
         gains = [GAINS.get(role.get(name), PITCH_GAINS) for name in robot.joint_names]
-        large = size(robot)
-        kp, kd = np.transpose(gains)
-        self._kp = large.of(kp, "N m")
-        self._kd = large.of(kd, "N m s")
+        units = zip(np.transpose(gains), ("N m", "N m s"), strict=True)
+        self._kp, self._kd = (size(robot).of(gain, unit) for gain, unit in units)
         self._legs = [leg - 6 for leg in leg_columns(robot)]
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
@@ -149,14 +147,13 @@ class TorqueServo:
         rate_error = command.rate - v[6:]
         held = self._kp * error + self._kd * rate_error
         swings = [leg for leg, x in zip(self._legs, command.feet, strict=True) if x == AIR]
-        if not swings:
-            return Drive(tau + held)
-        # torques per joint acceleration of the free body
-        whole = pin.crba(self._model, self._data, q)
-        free = whole[6:, 6:] - whole[6:, :6] @ np.linalg.solve(whole[:6, :6], whole[:6, 6:])
-        wish = FLIGHT_BANDWIDTH * (FLIGHT_CORNER * error + rate_error)
         if len(swings) == len(self._legs):
             swings = [np.arange(len(tau))]
+        if swings:
+            # torques per joint acceleration of the free body
+            whole = pin.crba(self._model, self._data, q)
+            free = whole[6:, 6:] - whole[6:, :6] @ np.linalg.solve(whole[:6, :6], whole[:6, 6:])
+            wish = FLIGHT_BANDWIDTH * (FLIGHT_CORNER * error + rate_error)
         for leg in swings:
             held[leg] = free[np.ix_(leg, leg)] @ wish[leg]
         return Drive(tau + held)
@@ -178,8 +175,8 @@ class WholeBodyServo:
         self._data = self._model.createData()
         self._motors = robot.limits
         large = size(robot)
-        self._give = GIVE * large.of(1.0, "N") ** -1
-        self._epsilon = EPSILON * large.of(1.0, "N") ** -2
+        self._give = GIVE / large.of(1.0, "N")
+        self._epsilon = EPSILON / large.of(1.0, "N") ** 2
         self._damping = large.of(DAMPING, "N m s") * self._motors.effort / self._motors.effort.max()
         self._pivots = {FLAT: robot.foot.center, TOE: robot.foot.tip}
         self._anchors = {stand: on_feet(robot, at) for stand, at in self._pivots.items()}
@@ -263,13 +260,12 @@ class WholeBodyServo:
         """Motions that the feet cannot make: Jacobian (k, nv), drift (k,), units (k,) of the wrench
         against each, and the plan's wrench (k,), about the points on which they stand.
         """
-        wrenches = np.zeros((2, 6)) if command.wrench is None else command.wrench
         rows = [np.zeros((0, self._model.nv + 3))]
         for side, stand in enumerate(command.feet):
             if stand == AIR:
                 continue
             foot = point_motion(self._model, self._data, self._anchors[stand][side])
-            load = wrenches[side].copy()
+            load = np.zeros(6) if command.wrench is None else command.wrench[side].copy()
             load[3:] -= pin.skew(foot.turn @ self._pivots[stand]) @ load[:3]
             # in axes that are turned about the vertical as the foot is
             yaw = np.arctan2(foot.turn[1, 0], foot.turn[0, 0])

@@ -69,15 +69,13 @@ class RecoveryStep:
         if self.side is None and self._needed(time, body, foot_force):
             self.starts_s.append(time)
             self._beyond_since = np.inf
-            self.side = int(
-                np.argmin([self._foothold(body, side, self._swing_s)[1] for side in (0, 1)])
-            )
+            missed = [self._foothold(body, side, self._swing_s)[1] for side in (0, 1)]
+            self.side = int(np.argmin(missed))
         if self.side is None:
             return
         gone = time - self.starts_s[-1]
-        if gone > self._swing_s or (
-            gone > self._swing_s / 2 and foot_force[self.side] > self._met_n
-        ):
+        met = gone > self._swing_s / 2 and foot_force[self.side] > self._met_n
+        if met or gone > self._swing_s:
             self.side = None
             self._from_s = time + self._settled_s
         elif gone < self._swing_s - self._least_s:
@@ -109,7 +107,8 @@ class RecoveryStep:
         """Axes (2, 2) of the standing foot, forward and left; the capture point from it (2,) along
         them, and where the foot's pressure keeps that best.
         """
-        c, s = body.attitudes[stance][:2, 0] / np.linalg.norm(body.attitudes[stance][:2, 0])
+        ahead = body.attitudes[stance, :2, 0]
+        c, s = ahead / np.linalg.norm(ahead)
         axes = np.array([[c, s], [-s, c]])
         capture = axes @ (_capture_point(body) - body.soles[stance][:2])
         return axes, capture, np.clip(capture, -self._half, self._half)

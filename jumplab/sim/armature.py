@@ -37,11 +37,11 @@ class Armature:
         self._lent = np.zeros((model.njoints, 1))  # by body
         # which bodies move with each entry of v
         self._carries = np.ones((model.nv, model.njoints))
-        for k, name in enumerate(robot.joint_names):
-            here = model.getJointId(name)
+        for k, armature in enumerate(self._armature):
+            here = model.getJointId(robot.joint_names[k])
             self._carries[6 + k] = np.isin(range(model.njoints), list(model.subtrees[here]))
-            for body in (here, model.parents[here]) if self._armature[k] else ():
-                self._lent[body] += self._armature[k]
+            for body in (here, model.parents[here]) if armature else ():
+                self._lent[body] += armature
                 self.lent[first[body]] = float(self._lent[body, 0])
 
     def returned(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:

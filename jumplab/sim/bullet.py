@@ -161,20 +161,17 @@ class BulletEngine(Engine):
     ) -> int:
         box = self._bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half)
         body = self._bullet.createMultiBody(0, box, basePosition=centre, baseOrientation=turn)
-        self._bullet.changeDynamics(body, -1, lateralFriction=GROUND_FRICTION)
-        self._bullet.changeDynamics(body, -1, restitution=0.0)
+        change = partial(self._bullet.changeDynamics, body, -1)
+        change(lateralFriction=GROUND_FRICTION)
+        change(restitution=0.0)
         if soft_m:
             stiffness, damping = self.spring(soft_m)
-            self._bullet.changeDynamics(
-                body, -1, contactStiffness=stiffness, contactDamping=damping
-            )
+            change(contactStiffness=stiffness, contactDamping=damping)
         return body
 
     def _index_links(self) -> None:
-        info = [
-            self._bullet.getJointInfo(self._body, i)
-            for i in range(self._bullet.getNumJoints(self._body))
-        ]
+        count = self._bullet.getNumJoints(self._body)
+        info = [self._bullet.getJointInfo(self._body, i) for i in range(count)]
         by_joint = {row[1].decode(): i for i, row in enumerate(info)}
         base = self._bullet.getBodyInfo(self._body)[0].decode()
         self.links = (base, *(row[12].decode() for row in info))  # Bullet's link i is links[i + 1]
@@ -308,9 +305,8 @@ class BulletEngine(Engine):
         step, link, arm, force, _ = self._presses(notes)
         wrench = np.zeros((len(notes), 2, 6))
         pushes = np.hstack([force, moments(arm, force)])
-        for side, foot in enumerate(self._feet):
-            on_it = link == foot
-            np.add.at(wrench[:, side], step[on_it], pushes[on_it])
+        on_foot, side = np.nonzero(link[:, None] == self._feet)
+        np.add.at(wrench, (step[on_foot], side), pushes[on_foot])
         touching = np.zeros((len(notes), len(self.links)), bool)
         touching[step, link + 1] = True
         return wrench, touching, np.array([note[1] for note in notes])

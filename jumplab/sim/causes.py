@@ -52,13 +52,13 @@ def signs(result: SimulationResult) -> tuple[Sign, ...]:
     if result.robot is None:
         raise ValueError("the log's robot is not known")
     until = int(np.argmax([*result.stray.any(axis=1), True]))
+    down = int(np.argmax([*(result.phase == "landing"), True]))
     rows = {"slip": _slip(result, until), "torque": _torque(result, until)}
-    if (result.phase == "landing").any():
-        down = int(np.argmax(result.phase == "landing"))
+    if down < len(result.t):
         rows["over-rotation"] = _over_rotation(result, down)
-        if down < until:
-            rows["knee stop"] = _knee_stop(result, down, until)
-            rows["tip"] = _tip(result, down, until)
+    if down < until:
+        rows["knee stop"] = _knee_stop(result, down, until)
+        rows["tip"] = _tip(result, down, until)
     first = sorted((row, cause) for cause, row in rows.items() if row is not None)
     first = first or [(len(result.t) - 1, "other")]
     return tuple(Sign(cause, float(result.t[row])) for row, cause in first)

@@ -90,12 +90,12 @@ def _largest_jump(result: SimulationResult) -> float:
     least = 1 / result.settings["engine"]["substeps"]
     model = result.robot.model
     change = np.diff(result.v, axis=0)
-    mean = result.v[:-1] + (1 + least) / 2 * change
+    way = STEP_S * (result.v[:-1] + (1 + least) / 2 * change)
     # a foot that comes down chatters: it may swing within a step, and be back at its end
     largest = maximum_filter1d(np.abs(change).max(axis=1), CHATTER)
     room = SWING * (1 - least) * largest * STEP_S
-    there = [pin.integrate(model, q, v * STEP_S) for q, v in zip(result.q[:-1], mean, strict=True)]
-    miss = [pin.difference(model, a, b) for a, b in zip(there, result.q[1:], strict=True)]
+    steps = zip(result.q[:-1], way, result.q[1:], strict=True)
+    miss = [pin.difference(model, pin.integrate(model, q, v), after) for q, v, after in steps]
     left = np.abs(miss) - room[:, None]
     return float(left.max(initial=0.0))
 
@@ -109,8 +109,8 @@ def _pushes(result: SimulationResult) -> tuple[np.ndarray, np.ndarray]:
     """
     force = np.zeros((len(result.t), 3))
     for push in result.settings.get("pushes", ()):
-        begin = max(0, push["step"])
-        force[begin : max(0, push["step"] + push["steps"])] += push["force_n"]
+        begin, end = np.maximum(0, [push["step"], push["step"] + push["steps"]])
+        force[begin:end] += push["force_n"]
     return force, np.array(result.settings.get("push_place_m", (0.0, 0.0, 0.0)))
 
 
@@ -131,15 +131,15 @@ def unexplained(result: SimulationResult) -> tuple[np.ndarray, np.ndarray]:
     pushes, place = _pushes(result)
     # the ground's wrenches, in the frames of the joints that carry the feet
     acting = pin.StdVec_Force([pin.Force.Zero()] * model.njoints)
+    anchors = on_feet(robot, np.zeros(3))
     feet = result.feet if engine["substeps"] == 1 else Gauge(robot).feet(states[0])
     ground = result.foot_wrench[:-1].reshape(-1, 2, 2, 3) @ feet[: len(left), :, :3, :3]
     ground = ground.reshape(-1, 2, 6)
-    for side, at in enumerate(on_feet(robot, np.zeros(3))):
+    for side, at in enumerate(anchors):
         ground[:, side] = ground[:, side] @ at.placement.toActionMatrixInverse()
-    left_foot, right_foot = (at.joint for at in on_feet(robot, np.zeros(3)))
     for k, row in enumerate(zip(*states, strict=True)):
-        acting[left_foot].vector = ground[k, 0]
-        acting[right_foot].vector = ground[k, 1]
+        for at, wrench in zip(anchors, ground[k], strict=True):
+            acting[at.joint].vector = wrench
         left[k] = pin.rnea(model, data, *row, acting)
     for k in np.flatnonzero(pushes[:-1].any(axis=1)):
         force = rotation(states[0][k, 3:7]).T @ pushes[k]
@@ -176,16 +176,11 @@ def _momentum_unexplained(result: SimulationResult) -> np.ndarray:
     """Force, and moment about the world's origin, (N - 1, 6) that momentum says and the ground does
     not.
     """
-    robot = result.robot
-    model = robot.model
-    data = model.createData()
-    weight = robot.total_mass * model.gravity.linear
-    rows = []
-    for state in zip(result.q, result.v, strict=True):
-        momentum = pin.computeCentroidalMomentum(model, data, *state).vector
-        rows.append((data.com[0].copy(), momentum[:3], momentum[3:]))
-    com, linear, spin = np.array(rows).swapaxes(0, 1)
-    spin = spin + np.cross(com, linear)
+    mass = result.robot.total_mass
+    weight = mass * result.robot.model.gravity.linear
+    _, com, velocity, momentum, _ = result.motion
+    linear = mass * velocity
+    spin = momentum + np.cross(com, linear)
     pushes, arm = _pushes(result)
     pushed = result.q[:, :3] + rotations(result.q[:, 3:7]) @ arm
     forces = result.foot_wrench[:, :, :3]
@@ -254,15 +249,16 @@ def _feet(result: SimulationResult) -> tuple[float, float]:
     foot = result.robot.foot
     wrench = result.foot_wrench[loaded, side]
     # a foot may move within a step: where it is at both ends of it
-    ends = result.feet[loaded, side], result.feet[loaded + 1, side]
-    before = ends[0]
+    before, after = (result.feet[rows, side] for rows in (loaded, loaded + 1))
     slip = friction_used(wrench[:, :3], before[:, :3, 3], ground)
     corners = before[:, None, :3, 3] + foot.corners @ before[:, :3, :3].swapaxes(1, 2)
     sunk = ground.depth_of(corners, soft=hard)
     # usual contacts act in the middle of the depth, beyond the tip of a tilted sole
     least = 0.0 if hard else sunk / 2
     beyond = [
-        _outside(foot, before, end, wrench, deep) - least for end in ends for deep in (0.0, sunk)
+        _outside(foot, before, end, wrench, deep) - least
+        for end in (before, after)
+        for deep in (0.0, sunk)
     ]
     # a foot that lies on its side presses with that
     flat = before[:, 2, 2] >= FACING

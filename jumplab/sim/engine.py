@@ -6,8 +6,9 @@ and passes ``test_sim_world.py``; all else knows no engine.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -36,7 +37,7 @@ class Log(NamedTuple):
     v: np.ndarray  # (n, nv)
     tau: np.ndarray  # (n, nv - 6) of the motors [N m]
     # (n, 2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
-    wrench: np.ndarray
+    foot_wrench: np.ndarray
     touching: np.ndarray  # (n, links) which links press on the ground
     colliding: np.ndarray  # (n,) whether links of the robot press on each other
 
@@ -63,7 +64,7 @@ class Kept(NamedTuple):
         return float(sum(link.mass for link in self.inertials.values()))
 
 
-class Engine(ABC):
+class Engine(AbstractContextManager):
     """A robot in a scene, advanced in steps of :data:`jumplab.sim.STEP_S`; a context manager.
 
     Outside of an engine everything is Pinocchio's: ``q`` and ``v`` of the base *link* frame, joints
@@ -118,9 +119,6 @@ class Engine(ABC):
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Engine:
-        return self
 
     def __exit__(self, *exc) -> None:
         self.close()

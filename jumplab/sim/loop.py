@@ -113,14 +113,16 @@ class Run:
         goal: np.ndarray,
         solves: tuple[int, int],
         rows: slice = slice(None),
+        steps_s: Sequence[float] = (),
         flights: int = 1,
         lands: Sequence[int] = BOTH,
         **settings: Any,
     ) -> SimulationResult:
         """The checked record of the run, or of some ``rows`` of it.
 
-        ``goal`` (nq,) is where the robot shall land, ``solves`` are the QPs posed and failed, and
-        it is to fly so many ``flights`` and to end the last one on the feet ``lands``.
+        ``goal`` (nq,) is where the robot shall land, ``solves`` are the QPs posed and failed,
+        ``steps_s`` the times of recovery steps, and it is to fly so many ``flights`` and to end the
+        last one on the feet ``lands``.
         """
         settings |= dict(
             scene=self.scene.name,
@@ -149,6 +151,7 @@ class Run:
             flights=flights,
             lands=lands,
             solves=solves,
+            steps_s=steps_s,
             settings=settings,
         )
         return replace(result, checks=check(result))
@@ -218,9 +221,10 @@ def simulate_jump(
         return step >= watched or fallen_s > AFTER_FALL_S
 
     run.play(controller.drive, over, q, v, first)
-    result = run.result(
+    return run.result(
         controller.goal,
         controller.solves,
+        steps_s=controller.steps_s,
         flights=len(tape.flights) if disturbance is None else 1,
         lands=tape.lands,
         reaim=control.get("reaim", False),
@@ -230,9 +234,6 @@ def simulate_jump(
         disturbance=disturbance and asdict(disturbance),
         **controller.to_json(),
     )
-    steps_s = controller.steps_s
-    stepped = dict(recovery_step_s=next(iter(steps_s), None), recovery_steps=len(steps_s))
-    return replace(result, metrics=replace(result.metrics, **stepped))
 
 
 def _check(tape: Tape, stand_s: float) -> None:

@@ -189,7 +189,7 @@ class MujocoEngine(Engine):
         self._feet = np.array([model.body(name).id for name in self.robot.foot.frames])
         self._torque = np.zeros(len(joints))
         self._back = np.zeros(4)  # from the world into the base's axes
-        # of the contact sensors in a step: all of them, those of the feet, forces on other links
+        # of the contact sensors in a step: all of them, and forces on links that are no feet
         self._felt = np.zeros((self.contact.substeps, model.nsensordata))
         columns = 3 + np.arange(9 * len(self.links)).reshape(-1, 9)
         self._stray = np.delete(columns, self._feet - 1, axis=0)[:, :3].ravel()

@@ -288,13 +288,13 @@ class Perturbation:
         root = ET.fromstring(limits(robot, left, {})[0])
         for link in root.iterfind("link[inertial]"):
             name = link.get("name")
-            inertial = link.find("inertial")
             factor = self.mass.get(name, 1.0)
-            scale(inertial.find("mass"), ("value",), factor)
+            scale(link.find("inertial/mass"), ("value",), factor)
             # a heavier link of the same shape has more inertia too; the further factor is a change
             # of shape
-            scale(inertial.find("inertia"), MOMENTS, factor * self.inertia.get(name, 1.0))
-            origin = inertial.find("origin")
+            moments = link.find("inertial/inertia")
+            scale(moments, MOMENTS, factor * self.inertia.get(name, 1.0))
+            origin = link.find("inertial/origin")
             xyz = np.array(origin.get("xyz").split(), float) + self.com.get(name, (0.0, 0.0, 0.0))
             origin.set("xyz", " ".join(f"{x:.12g}" for x in xyz))
         if self.payload_kg:
@@ -374,12 +374,13 @@ def _of_one_jump(tape: Tape | None) -> Tape:
 
 def _shoves(rng: np.random.Generator, ranges: Ranges) -> tuple[Shove, ...]:
     """One in each phase, or none where the range ends at nothing."""
-    out = []
+    shoves = []
     for phase in PHASES:
         low, high = getattr(ranges, f"shove_{phase}_n_s")
-        share, impulse, turn = rng.uniform((0.0, low, -np.pi), (1.0, high, np.pi)).tolist()
-        out += [Shove(phase, share, impulse, turn)] if high else []
-    return tuple(out)
+        drawn = rng.uniform((0.0, low, -np.pi), (1.0, high, np.pi)).tolist()
+        if high:
+            shoves.append(Shove(phase, *drawn))
+    return tuple(shoves)
 
 
 def _heavy_links(robot: Robot) -> list[str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 
 from jumplab.arguments import checked
 from jumplab.control import STAND_S
-from jumplab.control.kinematics import Gauge, about_vertical, pitch_of
+from jumplab.control.kinematics import Gauge, Motion, about_vertical, pitch_of
 from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io.columns import Named
 from jumplab.io.folder import read_json, write_file
@@ -63,10 +63,8 @@ class Finding:
         return {**asdict(self), "passed": self.passed}
 
     def __str__(self) -> str:
-        return (
-            f"{self.name}: {self.value:.4g} {self.unit}".rstrip()
-            + f" (at most {self.limit:.4g}; {self.catches})"
-        )
+        amount = f"{self.name}: {self.value:.4g} {self.unit}".rstrip()
+        return f"{amount} (at most {self.limit:.4g}; {self.catches})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +174,11 @@ class SimulationResult(Shown, Named):
         return Gauge(self.robot).feet(self.q)
 
     @cached_property
+    def motion(self) -> Motion:
+        """Place and motion of the robot as a whole, (N, ...) each."""
+        return Gauge(self.robot).motions(self.q, self.v)
+
+    @cached_property
     def stray(self) -> np.ndarray:
         """(N, links) whether a link touches the ground, but for the feet, which shall."""
         return self.touching & ~np.isin(self.link_names, self.robot.foot.frames)
@@ -197,17 +200,18 @@ class SimulationResult(Shown, Named):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All logs under the names of ``simulation.npz``."""
-        return {
-            "schema": np.array(SIMULATION_SCHEMA),
-            **{name: np.asarray(getattr(self, name)) for name in LOGS},
-        }
+        logs = {name: np.asarray(getattr(self, name)) for name in LOGS}
+        return {"schema": np.array(SIMULATION_SCHEMA), **logs}
 
     def to_json(self) -> dict:
         """Metrics, settings and findings as plain data, the content of ``simulation.json``."""
-        findings = [finding.to_json() for finding in self.checks]
-        checked = {"checks_passed": self.checks_passed, "checks": findings}
-        settings = {"settings": self.settings}
-        return {"schema": SIMULATION_SCHEMA, **asdict(self.metrics), **settings, **checked}
+        return dict(
+            schema=SIMULATION_SCHEMA,
+            **asdict(self.metrics),
+            settings=self.settings,
+            checks_passed=self.checks_passed,
+            checks=[finding.to_json() for finding in self.checks],
+        )
 
     @checked
     def save(self, folder: str | Path, extra: dict | None = None) -> None:
@@ -236,9 +240,8 @@ class SimulationResult(Shown, Named):
             if {len(log) for log in logs.values()} != {logs["t"].size}:
                 raise ValueError("logs of different lengths")
             numbers = {f.name: report[f.name] for f in fields(Metrics) if f.name in report}
-            metrics = Metrics(
-                **{k: tuple(x) if isinstance(x, list) else x for k, x in numbers.items()}
-            )
+            plain = {k: tuple(x) if isinstance(x, list) else x for k, x in numbers.items()}
+            metrics = Metrics(**plain)
             findings = tuple(
                 Finding(*(row[f.name] for f in fields(Finding))) for row in report["checks"]
             )
@@ -278,16 +281,17 @@ def record(
     flights: int = 1,
     lands: Sequence[int] = BOTH,
     solves: tuple[int, int] = (0, 0),
+    steps_s: Sequence[float] = (),
     settings: dict | None = None,
 ) -> SimulationResult:
     """The finished record of a run of ``robot`` as it really is, whose ``links`` are named.
 
     ``steps`` are those of the engine; ``goal`` (nq,) is how the tape ends, where the ground is
     really ``higher_m`` higher [m], after so many ``flights``, of which the last one ends on the
-    feet ``lands`` (0 left, 1 right); ``solves`` are QPs posed and failed. Raises
-    :class:`SolverError` if the engine's numbers have exploded.
+    feet ``lands`` (0 left, 1 right); ``solves`` are QPs posed and failed, ``steps_s`` times of
+    recovery steps. Raises :class:`SolverError` if the engine's numbers have exploded.
     """
-    q, v, tau, wrench, touching, colliding = steps
+    q, v, _, wrench, *_ = steps
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise SolverError("the engine lost the robot: its state is not finite", stage="simulation")
     gauge = Gauge(robot)
@@ -297,37 +301,39 @@ def record(
         phase[liftoff:touchdown] = "flight"
     if len(flown) == flights and flown[-1][1] is not None:
         phase[flown[-1][1] :] = "landing"
-    _, com, velocity, momentum, inertia = zip(*map(gauge.motion, q, v), strict=True)
+    motion = gauge.motions(q, v)
     log = dict(
+        **steps._asdict(),
         t=np.arange(len(q)) * STEP_S,
-        q=q,
-        v=v,
-        tau=tau,
-        foot_wrench=wrench,
         phase=phase,
-        com=np.array(com),
-        com_velocity=np.array(velocity),
-        L=np.array(momentum)[:, 1],
-        rho=np.array(inertia)[:, 1, 1],
-        touching=touching,
-        colliding=colliding,
+        com=motion.com,
+        com_velocity=motion.velocity,
+        L=motion.momentum[:, 1],
+        rho=motion.inertia[:, 1, 1],
     )
     for array in log.values():
         array.setflags(write=False)
     names = dict(link_names=links, joint_names=robot.joint_names)
     run = SimulationResult(**log, **names, metrics=None, settings=settings or {}, robot=robot)
+    vars(run)["motion"] = motion  # known already
     jump = _Jump(run, gauge, goal, flown, flights, list(lands))
-    verdict = zip(("standing_s", "landed", "reason"), jump.verdict(higher_m), strict=True)
+    standing_s, landed, reason = jump.verdict(higher_m)
     metrics = Metrics(
         **jump.loads(),
         **jump.launch(),
         **jump.landing(),
-        **dict(verdict),
+        standing_s=standing_s,
+        landed=landed,
+        reason=reason,
         self_collision_s=STEP_S * float(run.colliding.sum()),
         qp_solves=solves[0],
         qp_failures=solves[1],
+        recovery_step_s=next(iter(steps_s), None),
+        recovery_steps=len(steps_s),
     )
-    return replace(run, metrics=metrics)
+    # no copy, which would have to find the feet anew
+    object.__setattr__(run, "metrics", metrics)
+    return run
 
 
 @dataclass
@@ -404,11 +410,9 @@ class _Jump:
         foot = run.robot.foot
         # a turn moves the toes, and shall be no distance
         point = foot.center if heading else foot.tip
-        start, touch, end = (
-            np.array([x.act(point) for x in gauge.places(run.q[row])]) for row in (0, down, -1)
-        )
+        start, touch, end = (gauge.points(run.q[row], point) for row in (0, down, -1))
         way = (end - start).mean(axis=0)
-        heights = np.array([x.act(foot.center)[2] for x in gauge.places(run.q[down])])
+        heights = gauge.points(run.q[down], foot.center)[:, 2]
         on_them = heights[self.lands].max() - heights.min() < LEVEL_TOLERANCE_M
         seen = about_vertical(-heading)
         impact = run.foot_wrench[down:, :, :3].sum(axis=1)[: round(IMPACT_S / STEP_S)]
@@ -418,12 +422,11 @@ class _Jump:
         # with as many whole turns as the trunk has made
         x, y, z, w = run.q[:, 3:7].T
         trunk = np.unwrap(np.arctan2(2 * (w * z - x * y), 1 - 2 * (x * x + z * z)))
+        landed_m = float((touch - start)[self.lands, 0].mean())
         return dict(
             touchdown_s=float(run.t[down]),
             foot_distance_m=float(way[0]),
-            foot_distance_touchdown_m=(
-                float((touch - start)[self.lands, 0].mean()) if on_them else None
-            ),
+            foot_distance_touchdown_m=landed_m if on_them else None,
             side_m=float(way[1]),
             yaw_rad=float(np.unwrap([trunk[-1] - trunk[0], yaw])[1]),
             touchdown_trunk_pitch_rad=float(np.unwrap(pitch_of(run.q[: down + 1]))[-1]),
@@ -487,18 +490,17 @@ class _Jump:
         torque = np.abs(run.tau) / motors.effort
         speed = np.abs(rates) / motors.speed
 
-        def by_joint(values: np.ndarray) -> ByJoint:
-            return dict(zip(run.joint_names, values.tolist(), strict=True))
-
-        spent = motors_spent(motors, run.tau, rates)
-        out = dict(
-            saturated_s=by_joint(spent.sum(axis=0) * STEP_S),
-            overspeed_s=by_joint((speed > 1).sum(axis=0) * STEP_S),
-        )
+        by_joint = {
+            "saturated_s": motors_spent(motors, run.tau, rates).sum(axis=0) * STEP_S,
+            "overspeed_s": (speed > 1).sum(axis=0) * STEP_S,
+        }
+        out: dict[str, Any] = {}
         for name, ratio in (("max_torque_ratio", torque), ("max_speed_ratio", speed)):
             out[name] = float(ratio.max())
             out[f"{name}_before_touchdown"] = float(ratio[: self.touchdown].max())
-            out[f"{name}_by_joint"] = by_joint(ratio.max(axis=0))
+            by_joint[f"{name}_by_joint"] = ratio.max(axis=0)
+        for name, values in by_joint.items():
+            out[name] = dict(zip(run.joint_names, values.tolist(), strict=True))
         return out
 
 

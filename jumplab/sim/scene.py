@@ -52,6 +52,11 @@ class Block:
         """(3, 3) how it is turned."""
         return pin.rpy.rpyToMatrix(self.roll_rad, self.pitch_rad, 0.0)
 
+    @cached_property
+    def _up(self) -> list[float]:
+        """(3,) across its top."""
+        return self.turn[:, 2].tolist()
+
     @property
     def even(self) -> bool:
         """Whether its top is level."""
@@ -61,8 +66,12 @@ class Block:
         """Height of the plane of its top at ``x``, and ``y`` to the left of the jump [m]; arrays
         (...) for arrays.
         """
-        a, b, c = self.turn[:, 2]
+        a, b, c = self._up
         return self.top - (a * (x - self.pivot_m) + b * y) / c
+
+    def carries(self, x: float | np.ndarray, y: float | np.ndarray) -> bool | np.ndarray:
+        """Whether it lies below places (...) at ``x``, and ``y`` to the left of the jump [m]."""
+        return (self.x_from <= x) & (x <= self.x_to) & (self.y_from <= y) & (y <= self.y_to)
 
 
 NOTHING = Block(-REACH_M, REACH_M, -REACH_M)  # where there is no ground
@@ -163,11 +172,11 @@ class Scene:
         turn = about_vertical(self.along_rad)
         out = []
         for b in self.blocks:
-            low = np.array([b.x_from, b.y_from, b.top - b.thickness])
-            high = np.array([b.x_to, b.y_to, b.top])
-            pivot = np.array([b.pivot_m, 0.0, b.top])
-            centre = turn @ (pivot + b.turn @ ((low + high) / 2 - pivot))
-            out.append(((high - low) / 2, centre, pin.Quaternion(turn @ b.turn).coeffs()))
+            ends = [b.x_from, b.y_from, b.top - b.thickness], [b.x_to, b.y_to, b.top]
+            pivot = [b.pivot_m, 0.0, b.top]
+            centre = turn @ (pivot + b.turn @ (np.mean(ends, axis=0) - pivot))
+            half = np.ptp(ends, axis=0) / 2
+            out.append((half, centre, pin.Quaternion(turn @ b.turn).coeffs()))
         return out
 
     def within(self, x_from: float, x_to: float, half_width: float) -> Scene:
@@ -182,8 +191,7 @@ class Scene:
 
     def top_at(self, x: float, y: float = 0.0) -> float:
         """Height of the highest surface at ``x``, and ``y`` to the left of the jump [m]."""
-        here = [b for b in self.blocks if b.x_from <= x <= b.x_to and b.y_from <= y <= b.y_to]
-        tops = [b.top if b.even else b.height_at(x, y) for b in here]
+        tops = [b.height_at(x, y) for b in self.blocks if b.carries(x, y)]
         return float(max(tops, default=NOTHING.top))
 
     def _highest(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,14 +200,7 @@ class Scene:
         top [m].
         """
         x, y = np.moveaxis(places, -1, 0)
-        tops = [
-            np.where(
-                (b.x_from <= x) & (x <= b.x_to) & (b.y_from <= y) & (y <= b.y_to),
-                b.height_at(x, y),
-                -np.inf,
-            )
-            for b in self.blocks
-        ]
+        tops = [np.where(b.carries(x, y), b.height_at(x, y), -np.inf) for b in self.blocks]
         tops = np.array([*tops, np.full(x.shape, NOTHING.top)])
         number = tops.argmax(axis=0)
         return number, np.take_along_axis(tops, number[None], axis=0)[0]
@@ -252,7 +253,7 @@ class Scene:
         scene = self
         if len(self.blocks) == 1 and self.blocks[0] == Block(-REACH_M, REACH_M):
             scene = replace(self, along_rad=float(np.arctan2(way[1], way[0])))
-        first, last = ([scene.along(corner)[0] for corner in corners] for corners in (start, end))
+        first, last = (scene.along(corners)[:, 0] for corners in (start, end))
         gap = min(last) - max(first)
         if gap < GAP_M:
             raise InputError(
@@ -295,7 +296,7 @@ class Scene:
             q[:3] = middle + turn @ (q[:3] - middle)
         corners = gauge.corners(q)
         refused = f"scene {self.name}: the robot cannot stand on it at the start"
-        gap = max((corner[2] - self.below(corner)[1] for corner in corners), key=abs)
+        gap = max(corners[:, 2] - self._highest(self.along(corners))[1], key=abs)
         if abs(gap) > UNEVEN_M:
             raise InputError(
                 f"{refused}, a corner of its soles is {1e3 * gap:+.0f} mm above the "

@@ -91,11 +91,7 @@ class Perception:
             return {"state": "true"}
         states = map(np.array, zip(*self._errors, strict=True))
         tilt, speed = (float(x.max()) for x in estimation_error(*states))
-        return {
-            "state": "estimated",
-            "worst_tilt_error_rad": tilt,
-            "worst_velocity_error": speed,
-        }
+        return {"state": "estimated", "worst_tilt_error_rad": tilt, "worst_velocity_error": speed}
 
 
 def estimation_error(
@@ -107,8 +103,5 @@ def estimation_error(
     true, believed = (rotations(x[..., 3:7]) for x in (q, believed_q))
     # between the two ideas of up, in the trunk's axes
     level = (true[..., 2, :] * believed[..., 2, :]).sum(axis=-1)
-    moved = (
-        np.einsum("...ij,...j->...i", *x)
-        for x in ((believed, believed_v[..., :3]), (true, v[..., :3]))
-    )
-    return np.arccos(np.clip(level, -1.0, 1.0)), np.linalg.norm(np.subtract(*moved), axis=-1)
+    moved = believed @ believed_v[..., :3, None] - true @ v[..., :3, None]
+    return np.arccos(np.clip(level, -1.0, 1.0)), np.linalg.norm(moved[..., 0], axis=-1)
