@@ -21,6 +21,7 @@ from jumplab.io.motion import Motion, steady
 from jumplab.io.tensors import read_tensors
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet
 from jumplab.robot.files import SHIPPED, read_toml
 
 ENDINGS = (".pkl", ".npz", ".csv", ".motion")
@@ -94,10 +95,10 @@ class Clip(Shown):
         return replace(clip, platform_m=task.platform_m) if task else clip
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Raw:
     """Content of a clip's file: base (n, 3) [m], its quaternions (n, 4) x y z w, joints (n, k)
-    [rad].
+    [rad]; raises ValueError if these are no arrays of numbers.
     """
 
     base: np.ndarray
@@ -107,6 +108,13 @@ class _Raw:
     fps: float | None = None
     names: tuple[str, ...] | None = None
     usual_fps: float = USUAL_FPS  # where nobody says
+
+    def __post_init__(self) -> None:
+        for name in ("base", "turn", "joints"):
+            array = np.asarray(getattr(self, name))
+            if array.dtype.kind not in "fiu":
+                raise ValueError(f"{name}: no real numbers")
+            setattr(self, name, array)
 
 
 # files
@@ -158,16 +166,16 @@ def _content(path: Path) -> Mapping[str, Any]:
 
 def _columns(text: str) -> Mapping[str, Any]:
     """A table with commas: of names in its first line, else of x y z, quaternion and joints."""
-    first = text.lstrip().splitlines()[0].split(",")
+    head, _, rows = text.lstrip().partition("\n")
+    names = head.rstrip().split(",")
     try:
-        float(first[0])
+        float(names[0])
         return {"rows": np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2)}
     except ValueError:
-        rows = text.lstrip().partition("\n")[2]
         if not rows.strip():
             raise ValueError("no rows") from None
         table = np.loadtxt(io.StringIO(rows), delimiter=",", ndmin=2)
-        return dict(zip(first, table.T, strict=True))
+        return dict(zip(names, table.T, strict=True))
 
 
 def _rate(x: Mapping[str, Any]) -> float | None:
@@ -294,8 +302,8 @@ def read_clips(
         try:
             reader = FORMS[form]
             raw = _of_arrays(reader, x, form) if isinstance(reader, str) else reader(x)
-            names = raw.names or tuple(map(str, x.get("joint_names", ()))) or None
-            raw = replace(raw, fps=_rate(x), names=names, **_numbers(raw))
+            raw.names = raw.names or tuple(map(str, x.get("joint_names", ()))) or None
+            raw.fps = _rate(x)
         except (KeyError, IndexError, TypeError, ValueError) as e:
             raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
         clips.append(_clip(where, name, raw, robot, fps, order))
@@ -337,15 +345,6 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
     return Clip(name, robot, q, rate, raw.origin, tuple(notes))
 
 
-def _numbers(raw: _Raw) -> dict[str, np.ndarray]:
-    """Base, quaternions and joints as arrays; raises ValueError if they are none."""
-    out = {name: np.asarray(getattr(raw, name)) for name in ("base", "turn", "joints")}
-    for name, array in out.items():
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: no real numbers")
-    return out
-
-
 def _faults(raw: _Raw) -> Iterator[str]:
     """Sentences on what makes arrays no motion in metres and radians, z up."""
     n = len(raw.base)
@@ -374,19 +373,21 @@ def _faults(raw: _Raw) -> Iterator[str]:
     away = np.abs(raw.base)
     if np.median(away.max(axis=1)) > 50:
         yield f"the base is {away.max():.0f} m away; it looks like cm or mm: pass metres"
-
-    def upright(turn: np.ndarray, axis: int = 2) -> float:
-        return float(np.median(Rotation.from_quat(turn).as_matrix()[:, axis, 2]))
-
-    if upright(raw.turn) > 0.5:
+    _, y, z = _upwards(raw.turn)
+    if z > 0.5:
         return
-    if upright(raw.turn, 1) > 0.9 and np.median(raw.base[:, 1]) > np.median(raw.base[:, 2]):
+    if y > 0.9 and np.median(raw.base[:, 1]) > np.median(raw.base[:, 2]):
         yield "the robot's up is the world's y; turn the clip so that z points up"
-    if upright(_first_wxyz(raw.turn)) > 0.9:
+    if _upwards(_first_wxyz(raw.turn))[2] > 0.9:
         yield (
             "its quaternions, read as x y z w, lay the robot down or stand it on its head; read as "
             "w x y z they keep it upright: reorder them to x y z w"
         )
+
+
+def _upwards(turn: np.ndarray) -> np.ndarray:
+    """The base's z axis in the world (3,), the median of attitudes (n, 4)."""
+    return np.median(Rotation.from_quat(turn).as_matrix()[..., 2], axis=0)
 
 
 def _fitted(where: str, raw: _Raw, robot: Robot, order: str) -> tuple[Robot, np.ndarray]:
@@ -432,9 +433,9 @@ def _siblings(robot: Robot) -> Iterator[Robot]:
     yield robot
     if robot.name not in SHIPPED:
         return
-    texts = {name: read_toml(path.read_text(), name) for name, path in SHIPPED.items()}
-    for name, config in texts.items():
-        if name != robot.name and config["urdf"] == texts[robot.name]["urdf"]:
+    urdfs = {name: read_toml(path.read_text(), name)["urdf"] for name, path in SHIPPED.items()}
+    for name, urdf in urdfs.items():
+        if name != robot.name and urdf == urdfs[robot.name]:
             yield Robot.load(name)
 
 
@@ -459,11 +460,11 @@ def _check_order(where: str, raw: _Raw, robot: Robot, q: np.ndarray, order: str)
 def _tilt(robot: Robot, q: np.ndarray) -> float:
     """Median angle of the lower sole to the ground [rad], in configurations (n, nq)."""
     data = robot.model.createData()
-    frames = [robot.model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames]
+    soles = on_feet(robot, robot.foot.center)
     upright = []
     for row in q[:: max(1, len(q) // LOOKED_AT)]:
-        pin.framesForwardKinematics(robot.model, data, row)
-        lower = min((data.oMf[k] for k in frames), key=lambda x: x.act(robot.foot.center)[2])
+        pin.forwardKinematics(robot.model, data, row)
+        lower = min((sole.place(data) for sole in soles), key=lambda place: place.translation[2])
         upright.append(lower.rotation[2, 2])
     return float(np.arccos(min(1.0, np.median(upright))))
 
@@ -471,8 +472,7 @@ def _tilt(robot: Robot, q: np.ndarray) -> float:
 def _check_joints(where: str, robot: Robot, q: np.ndarray) -> None:
     """Refuse joints that are out of their ranges most of the time: another order, or robot."""
     limits = robot.limits
-    beyond = np.maximum(limits.lower - q[:, 7:], q[:, 7:] - limits.upper)
-    excess = np.median(beyond, axis=0)
+    excess = np.median(np.maximum(limits.lower - q[:, 7:], q[:, 7:] - limits.upper), axis=0)
     worst = int(excess.argmax())
     if excess[worst] > BEYOND_RAD:
         raise InputError(

@@ -7,7 +7,6 @@ import logging
 import pickle
 from collections.abc import Callable, Mapping
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from jumplab.robot import Robot
 
 HELD_RAD = 0.02  # by which joints that a format leaves out may move
 LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
-PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
+PHASES = ("launch", "flight", "landing")
 
 
 def default_name(format_name: str, source: str) -> str:
@@ -116,7 +115,7 @@ def joint_table(whole: Whole, x: Motion, fps: float) -> str:
     left, right = x.contact.T
     head = {
         "time_s": x.t,
-        "phase_0_launch_1_flight_2_landing": [PHASE_CODES[str(phase)] for phase in x.phase],
+        "phase_0_launch_1_flight_2_landing": [PHASES.index(phase) for phase in x.phase],
         "contact_left": left,
         "contact_right": right,
     }
@@ -242,7 +241,8 @@ def states(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     """
     arrays = tracked(whole, x, fps)
     touching = np.zeros(arrays["body_pos_w"].shape[:2], bool)
-    touching[:, [1 + whole.joints.index(joint) for joint, _ in whole.feet]] = x.contact
+    feet = [whole.model.names[foot.joint] for foot in whole.feet(np.zeros(3))]
+    touching[:, [1 + whole.joints.index(joint) for joint in feet]] = x.contact
     return {
         "fps": arrays["fps"].item(),
         "dof_pos": arrays["joint_pos"],
@@ -317,13 +317,13 @@ def animated(whole: Whole, x: Motion, fps: float) -> str:
 
 def pybullet_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     """The URDF, the trajectory, and a script of ten lines that shows it."""
-    script = (resources.files("jumplab.io") / "replay.py.txt").read_text(encoding="utf-8")
-    words = {"script": script.strip(), "source": x.source, "robot": whole.robot.name}
+    script = filled("io/replay.py.txt")
+    about = filled("io/replay.md", script=script.strip(), source=x.source, robot=whole.robot.name)
     return {
         "robot.urdf": whole.urdf,
         "trajectory.npz": {"hz": np.array(fps), **plain_arrays(whole, x, fps)},
         "replay.py": script,
-        "README.md": filled("io/replay.md", **words),
+        "README.md": about,
     }
 
 
@@ -387,8 +387,11 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
         "phase": x.phase,
         "fps": np.array(fps),
     }
-    script = (resources.files("jumplab.io") / "play.py.txt").read_text(encoding="utf-8")
-    return {"robot.xml": spec.to_xml(), "motion.npz": arrays, "play.py": script}
+    return {
+        "robot.xml": spec.to_xml(),
+        "motion.npz": arrays,
+        "play.py": filled("io/play.py.txt"),
+    }
 
 
 CONTENTS: Mapping[str, Callable[[Whole, Motion, float], Any]] = {

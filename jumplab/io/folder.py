@@ -44,7 +44,7 @@ SCHEMA = "jumplab-result-1"
 PACKAGES = ("jumplab", "casadi", "pin", "proxsuite", "coal", "pybullet", "mujoco", "numpy", "scipy")
 PACKAGES += ("matplotlib", "cvxpy", "clarabel")
 # the same sources, built for later Pythons under another name
-BUILDS = {"pybullet": "pybullet-arm64"}
+BUILDS = {"pybullet-arm64": "pybullet"}
 PLAN = "plan.npz"
 URDF = "robot.urdf"
 CONFIG = "robot.toml"
@@ -139,12 +139,10 @@ def _remove(path: Path) -> None:
 @cache  # a sweep audits thousands of plans
 def versions() -> dict[str, str]:
     """Version of Python and of every package that shapes a result."""
-    numbers = {"python": platform.python_version()}
-    for name in PACKAGES:
-        for build in (name, BUILDS.get(name, name)):
-            with contextlib.suppress(metadata.PackageNotFoundError):
-                numbers.setdefault(name, metadata.version(build))
-        numbers.setdefault(name, "not installed")
+    numbers = {"python": platform.python_version(), **dict.fromkeys(PACKAGES, "not installed")}
+    for build in (*BUILDS, *PACKAGES):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            numbers[BUILDS.get(build, build)] = metadata.version(build)
     return numbers
 
 

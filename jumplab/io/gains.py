@@ -50,18 +50,17 @@ class Dynamics:
         motors = [robot.actuators.get(name, {}) for name in self.model.names[2:]]
         self.model.armature[6:] = [motor.get("armature", 0.0) for motor in motors]
         self._damping = np.array([motor.get("damping", 0.0) for motor in motors])
-        tip = pin.SE3(np.eye(3), robot.foot.tip)
-        self._tips = [(self.model.getJointId(name), place * tip) for name, place in whole.feet]
+        self._tips = whole.feet(robot.foot.tip)
 
     def held(self, q: np.ndarray, carries: np.ndarray) -> Held:
         """Joint, place and rows that the ground holds, of each foot that ``carries`` (2,) names."""
         pin.forwardKinematics(self.model, self.data, q)
         out = []
-        for (joint, place), down in zip(self._tips, carries, strict=True):
-            tipped = -(self.data.oMi[joint] * place).rotation[2, 0]  # toes down
+        for tip, down in zip(self._tips, carries, strict=True):
+            tipped = -tip.place(self.data).rotation[2, 0]  # toes down
             if down:
                 rows = [row for row in range(6) if row != PITCH or tipped < FLAT_RAD]
-                out.append((joint, place, rows))
+                out.append((tip.joint, tip.placement, rows))
         return out
 
     def jacobians(self, held: Held) -> list[np.ndarray]:

@@ -34,6 +34,7 @@ from jumplab.show.style import (
     new_figure,
     panel_letters,
     phase_handles,
+    runs,
     shade,
     themed,
 )
@@ -222,18 +223,17 @@ def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
 
 def _draw_motor(ax: Axes, motor: MotorLimits, limits: Limits) -> None:
     """A motor's torque against speed, as far as it goes; dashed as far as the planner goes."""
-    corner, free = motor.corner_speed, motor.no_load_speed
-    x = np.array([-free, -corner, 0.0, corner, free])
+    free = motor.no_load_speed
+    x = np.array([-free, -motor.corner_speed, motor.corner_speed, free])
     edges = motor.range(x)
     ax.fill_between(x, *edges, color=BAND, linewidth=0)
     for edge in edges:
         ax.plot(x, edge, **LIMIT_STYLE)
     cut = limits.speed_share * motor.speed
-    rates = np.array([-cut, min(corner, cut), cut, cut])
-    most = limits.torque_share * motor.range(rates)[1]
-    most[-1] = -limits.torque_share * motor.effort
-    for sign in (1, -1):
-        ax.plot(sign * rates, sign * most, **REFERENCE_STYLE)
+    rates = np.clip(x, -cut, cut)
+    least, most = motor.range(rates)
+    around = limits.torque_share * np.append(least, most[::-1])
+    ax.fill(np.append(rates, rates[::-1]), around, fill=False, **REFERENCE_STYLE)
     ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * free, 1.08 * free))
     ax.set_ylim(-1.12 * motor.effort, 1.12 * motor.effort)
 
@@ -274,9 +274,8 @@ def active(plan: JumpPlan, limits: Limits | None = None) -> Figure:
     for k, name in enumerate(names):
         for phase, color in PHASE_COLORS.items():
             used = rows[name] & (tape.phase == phase)
-            edges = np.flatnonzero(np.diff(np.r_[False, used, False].astype(int)))
-            last = len(tape.t) - 1
-            bars = [(tape.t[a], tape.t[min(b, last)] - tape.t[a]) for a, b in edges.reshape(-1, 2)]
+            spans = [tape.t[run[0] : run[-1] + 2] for run in runs(used) if used[run[0]]]
+            bars = [(span[0], np.ptp(span)) for span in spans]
             ax.broken_barh(bars, (k - 0.35, 0.7), facecolor=color, edgecolor=color, linewidth=0.8)
     mark_time(ax, (_heel_up_time(tape), tape.takeoff_time))
     ax.set_yticks(range(len(names)), names)
@@ -374,19 +373,16 @@ def _strip_rows(record: SimulationResult | Tape, height: np.ndarray) -> np.ndarr
     """Rows of the frames: beginning, deepest and end of each time on the ground, some of each
     flight.
     """
-    end = len(record.t) - 1
-    edges = np.flatnonzero(record.phase[1:] != record.phase[:-1]) + 1
-    pieces = np.split(np.arange(end + 1), edges)
+    pieces = runs(record.phase)
     if len(pieces) == 1:  # it never left the ground
-        return np.linspace(0, end, 5).astype(int)
+        return np.linspace(0, len(record.t) - 1, 5).astype(int)
     shares = FLIGHT_SHARES if len(pieces) < 4 else FLIGHT_SHARES[1:2]
     rows = []
     for piece in pieces:
-        first, last = int(piece[0]), int(piece[-1])
-        if record.phase[first] == "flight":
-            rows += [first + int(share * (last - first)) for share in shares]
-            continue
-        rows += [first, first + int(np.argmin(height[piece])), last]
+        if record.phase[piece[0]] == "flight":
+            rows += [piece[int(share * (len(piece) - 1))] for share in shares]
+        else:
+            rows += [piece[0], piece[np.argmin(height[piece])], piece[-1]]
     return np.array(rows)
 
 

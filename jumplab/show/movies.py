@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib import import_module, resources
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -277,8 +277,7 @@ def _world(robot: Robot, scene: Scene, marks_m: Sequence[float] = ()) -> mujoco.
     """
     import mujoco
 
-    text = (resources.files("jumplab.show") / "world.xml").read_text(encoding="utf-8")
-    spec = mujoco.MjSpec.from_string(text)
+    spec = mujoco.MjSpec.from_string(filled("show/world.xml"))
     box = mujoco.mjtGeom.mjGEOM_BOX
     for half, middle, turn in scene.within(*SHOWN_M, 4.0).boxes():
         place = dict(size=half, pos=middle, quat=np.roll(turn, 1))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib import resources
 from pathlib import Path
 from threading import RLock
 from typing import Any
@@ -57,7 +56,7 @@ NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}
 # of the style, in points: they grow with a font.size of the user's
 TEXT_SIZES = [f"{of}.labelsize" for of in ("axes", "xtick", "ytick")]
 TEXT_SIZES += ["axes.titlesize", "legend.fontsize"]
-STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
+STYLE_FILE = Path(__file__).with_name("jumplab.mplstyle")
 
 
 def use_style() -> None:
@@ -170,15 +169,19 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
     t, y = (shaped(x, (len(phase),), name) for x, name in ((t, "t"), (y, "y")))
     if unknown := sorted({*map(str, phase)} - {*PHASE_COLORS}):
         raise InputError(f"phase {unknown[0]!r}: must be one of {', '.join(PHASE_COLORS)}")
-    cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
     lines = []
-    for rows in np.split(np.arange(len(phase)), cuts):
+    for rows in runs(phase):
         look = {"color": PHASE_COLORS[str(phase[rows[0]])]} | kwargs
         try:
             lines += ax.plot(t[rows], y[rows], **look)
         except (AttributeError, TypeError, ValueError) as e:
             raise InputError(f"no line can look like {quoted(kwargs)}: {quoted(e)}") from None
     return lines
+
+
+def runs(values: np.ndarray) -> list[np.ndarray]:
+    """Rows of each run of equal ``values`` (n,), such as phases, in their order."""
+    return np.split(np.arange(len(values)), np.flatnonzero(values[1:] != values[:-1]) + 1)
 
 
 def compare(

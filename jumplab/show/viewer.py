@@ -25,7 +25,7 @@ from jumplab.robot import Robot
 from jumplab.robot.files import LEG
 from jumplab.show.bodies import ABOVE_M
 from jumplab.show.shapes import PAINTS, Part, Trace, ground_forces, parts_of, trace
-from jumplab.show.style import PHASE_COLORS, describe_task, made_with
+from jumplab.show.style import PHASE_COLORS, describe_task, made_with, runs
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
 
@@ -157,13 +157,13 @@ def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, An
     """Data with which the page plays a motion that goes this way."""
     motion = whole.every(FPS)
     forces = ground_forces(whole, FPS, way, scene)
-    words = [_words(*row) for row in zip(motion.phase, motion.contact, strict=True)]
-    cuts = [k for k, word in enumerate(words) if k == 0 or word != words[k - 1]]
+    words = np.array(list(map(_words, motion.phase, motion.contact)))
+    cuts = [run[0] for run in runs(words)]
     return {
         "bodies": way.joints.shape[1],
         "frames": len(motion.t),
         "phases": [
-            [float(motion.t[k] - motion.t[0]), str(motion.phase[k]), words[k]] for k in cuts
+            [float(motion.t[k] - motion.t[0]), str(motion.phase[k]), str(words[k])] for k in cuts
         ],
         "poses": _packed(way.joints),
         "path": _packed(way.com),
@@ -192,7 +192,7 @@ def _part(part: Part) -> dict[str, Any]:
 
 def _packed(values: np.ndarray) -> str:
     """Base64 of numbers as 32-bit floats."""
-    return base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
+    return base64.b64encode(values.astype("<f4").tobytes()).decode()
 
 
 def _values(
