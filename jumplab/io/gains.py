@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from jumplab.io.motion import Motion
@@ -72,11 +73,9 @@ class Dynamics:
         """Accelerations, and contact forces with their sign turned (nv + rows, ...), of right-hand
         sides of that size, by ``jacobians`` (rows, nv) of each foot.
         """
-        mass = self.data.M
-        rows = np.vstack([np.zeros((0, len(mass))), *jacobians])
-        return np.linalg.solve(
-            np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]]), right
-        )
+        rows = np.vstack([np.zeros((0, self.model.nv)), *jacobians])
+        none = np.zeros((len(rows), len(rows)))
+        return np.linalg.solve(np.block([[self.data.M, rows.T], [rows, none]]), right)
 
     def accelerations(
         self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, held: Held
@@ -169,13 +168,13 @@ def gains(whole: Whole, x: Motion) -> tuple[np.ndarray, np.ndarray]:
     cost = costs(whole)
     value = np.diag(cost[0])
     out = np.zeros((len(q), len(order), 2 * whole.model.nv), np.float32)
-    rows = [*range(len(q)), *[len(q) - 1] * round(HOLD_S / PERIOD_S)]
-    step = None
-    for ahead, k in zip([None, *rows[:0:-1]], rows[::-1], strict=True):
-        if k != ahead:
-            held = dynamics.held(q[k], x.contact[k])
-            step = discrete(*dynamics.derivatives(q[k], v[k], tau[k], held))
-        gain, value = riccati(*step, *cost, value)
+    lasts = np.ones(len(q), int)  # periods
+    lasts[-1] += round(HOLD_S / PERIOD_S)
+    for k in reversed(range(len(q))):
+        held = dynamics.held(q[k], x.contact[k])
+        step = discrete(*dynamics.derivatives(q[k], v[k], tau[k], held))
+        for _ in range(lasts[k]):
+            gain, value = riccati(*step, *cost, value)
         out[k] = (gain @ from_mujoco(q[k], v[k], order))[order]
     return x.t, out
 
@@ -184,10 +183,7 @@ def from_mujoco(q: np.ndarray, v: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Errors (2 nv, 2 nv) in Pinocchio's axes and order of MuJoCo's small ones."""
     nv = len(v)
     back = Rotation.from_quat(q[3:7]).as_matrix().T
-    out = np.zeros((2 * nv, 2 * nv))
-    for first in (0, nv):
-        out[first : first + 3, first : first + 3] = back
-        out[first + 3 : first + 6, first + 3 : first + 6] = np.eye(3)
-        out[first + 6 + order, first + 6 + np.arange(nv - 6)] = 1.0
+    parts = back, np.eye(3), np.eye(len(order))[:, order]
+    out = block_diag(*parts, *parts)
     out[nv : nv + 3, 3:6] = pin.skew(v[:3])  # own axes turn with the base
     return out

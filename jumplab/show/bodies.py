@@ -9,6 +9,7 @@ through here get equal scales.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -24,7 +25,7 @@ from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.sagittal import rotated
 from jumplab.robot.stance import stance_angles, stance_configuration
 from jumplab.robot_import.urdf import placed
-from jumplab.show.shapes import rounded_body
+from jumplab.show.shapes import Part, rounded_body
 from jumplab.show.style import (
     FLIGHT,
     GROUND,
@@ -72,22 +73,26 @@ class Silhouette:
         self._axes = VIEWS[view]
         self._data = robot.model.createData()
         pin.forwardKinematics(self._model, self._data, pin.neutral(self._model))
-        parts = rounded_body(robot)
-        left = [self._data.oMi[p.joint].act(p.points.mean(axis=0))[1] for p in parts]
+        self._parts = rounded_body(robot)
         if view == "side":  # far ones first
-            parts = [parts[k] for k in np.argsort(left, kind="stable")]
-        self._parts = [
-            (part, "far" if y < -1e-3 and view == "side" and part.kind != "trunk" else part.kind)
-            for part, y in zip(parts, sorted(left), strict=True)
-        ]
+            self._parts = [
+                replace(part, kind="far")
+                if self._left(part) < -1e-3 and part.kind != "trunk"
+                else part
+                for part in sorted(self._parts, key=self._left)
+            ]
+
+    def _left(self, part: Part) -> float:
+        """How far to the left a part is [m]."""
+        return self._data.oMi[part.joint].act(part.points.mean(axis=0))[1]
 
     def outlines(self, q: np.ndarray) -> list[tuple[str, np.ndarray]]:
         """(kind, outline (n, 2) [m]) of every box at a configuration (nq,), far ones first."""
         pin.forwardKinematics(self._model, self._data, q)
         outlines = []
-        for part, kind in self._parts:
+        for part in self._parts:
             flat = placed(self._data.oMi[part.joint], part.points)[:, self._axes]
-            outlines.append((kind, flat[ConvexHull(flat).vertices]))
+            outlines.append((part.kind, flat[ConvexHull(flat).vertices]))
         return outlines
 
     def joints(self, q: np.ndarray) -> dict[str, np.ndarray]:
@@ -197,8 +202,7 @@ def five_link_points(
     """Places (2,) [m] of toe, heel, joints, hand and com for link angles (5,) [rad]."""
     toe = shaped(toe, (2,), "toe")
     angles = shaped(angles, (len(model.span),), "angles")
-    spans = [rotated(angle, span) for angle, span in zip(angles, model.span, strict=True)]
-    tips = toe + np.cumsum(spans, axis=0)
+    tips = toe + np.cumsum(list(map(rotated, angles, model.span)), axis=0)
     places = dict(zip(("ankle", "knee", "hip", "shoulder", "hand"), tips, strict=True))
     com = toe + model.mass @ model.link_coms(angles) / model.total_mass
     return places | {"toe": toe, "heel": toe + rotated(angles[0], model.heel), "com": com}
@@ -244,9 +248,9 @@ def robot_sheet(robot: Robot) -> Figure:
     axes = fig.subplots(1, 3)
     q = stance_configuration(robot)
     side = Silhouette(robot)
-    top = max(outline[:, 1].max() for _, outline in side.outlines(q))
     com = side.com(q)
     draw_robot(axes[0], side, q, BODY)
+    top = axes[0].dataLim.y1  # of the robot
     draw_com(axes[0], com)
     axes[0].annotate("CoM", com, (8, 0), va="center", **(NOTE_STYLE | {"color": VERMILION}))
     _draw_joints(axes[1], robot, q, top)

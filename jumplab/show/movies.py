@@ -131,9 +131,7 @@ def movie(
             tell("drawing frame", k + 1, len(looks))
             arrows = () if pressed is None else _arrows(pressed[k], robot)
             view = _camera_at(look, distance_m)
-            phase = str(motion.phase[k])
-            picture = Image.fromarray(_draw(renderer, way.joints[k], view, phase, arrows))
-            picture = picture.reduce(FINER)
+            picture = _draw(renderer, way.joints[k], view, str(motion.phase[k]), arrows)
             words = f"{motion.t[k] - motion.t[0]:.2f} s, half speed"
             ImageDraw.Draw(picture).text((10, size[1] - 22), words, fill=INK)
             pictures.append(picture)
@@ -165,19 +163,19 @@ def camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
     still unless the jump is long.
     """
     base = way.joints[:, 0, :2]
-    height = way.joints[..., 2].max(axis=1)  # of the highest joint
-    top = height.max() + HEAD * height[0]
-    low = way.joints[..., 2].min() - LOW * height[0]
-    looks = np.empty((len(base), 3))
+    heights = way.joints[..., 2]
+    tall = heights[0].max()  # the highest joint at first
+    top = heights.max() + HEAD * tall
+    low = heights.min() - LOW * tall
+    looks = np.full((len(base), 3), (top + low) / 2)
     looks[:, :2] = (base.min(axis=0) + base.max(axis=0)) / 2
-    looks[:, 2] = (top + low) / 2
     long = np.ptp(base[:, 0])
     if long > FIXED_M:
         width = max(1, round(GLIDE_S * rate_hz)) | 1
         looks[:, :2] = uniform_filter1d(base, width, axis=0, mode="nearest")
         long = 0.0
     wide, high = KINDS["gif"][1]
-    half = max(top - low, (long + AROUND * height[0]) * high / wide) / 2
+    half = max(top - low, (long + AROUND * tall) * high / wide) / 2
     return looks, half / np.tan(np.radians(OPENING_DEG) / 2)
 
 
@@ -248,9 +246,9 @@ def _draw(
     poses: np.ndarray,
     camera: mujoco.MjvCamera,
     phase: str,
-    arrows: Sequence[tuple[np.ndarray, np.ndarray]] = (),
-) -> np.ndarray:
-    """Pixels (h, w, 3) of the joints at ``poses`` (njoints - 1, 7), and of arrows [m]."""
+    arrows: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> Image.Image:
+    """The joints at ``poses`` (njoints - 1, 7), and arrows [m]."""
     import mujoco
 
     model = renderer.model
@@ -268,12 +266,12 @@ def _draw(
         mujoco.mjv_initGeom(arrow, kind, np.zeros(3), np.zeros(3), np.zeros(9), ARROW_RGBA)
         mujoco.mjv_connector(arrow, kind, ARROW_RADIUS_M, start, end)
         scene.ngeom += 1
-    return renderer.render()
+    return Image.fromarray(renderer.render()).reduce(FINER)
 
 
-def _world(robot: Robot, scene: Scene, marks_m: Sequence[float] = ()) -> mujoco.MjModel:
-    """Sky and light of ``world.xml``, the ground with lines across, and the robot's parts on a body
-    per joint.
+def _world(robot: Robot, scene: Scene, marks_m: Sequence[float]) -> mujoco.MjModel:
+    """Sky and light of ``world.xml``, the ground with lines across, counted from the first of the
+    marks, and the robot's parts on a body per joint.
     """
     import mujoco
 
@@ -282,12 +280,10 @@ def _world(robot: Robot, scene: Scene, marks_m: Sequence[float] = ()) -> mujoco.
     for half, middle, turn in scene.within(*SHOWN_M, 4.0).boxes():
         place = dict(size=half, pos=middle, quat=np.roll(turn, 1))
         spec.worldbody.add_geom(type=box, material="floor", **place)
-    if marks_m:
-        counts = np.arange(*np.round(np.array(SHOWN_M) / LINE_M))
-        lines = [(marks_m[0] + LINE_M * k, 0.0, LINE_RGBA) for k in counts]
-        for x, lift, color in [*lines, *((x, 0.001, MARK_RGBA) for x in marks_m)]:
-            at = [x, 0.0, scene.top_at(x) + lift]
-            spec.worldbody.add_geom(type=box, size=LINE_HALF_M, pos=at, rgba=color)
+    lines = [(x, 0.0, LINE_RGBA) for x in marks_m[0] + np.arange(*SHOWN_M, LINE_M)]
+    for x, lift, color in [*lines, *((x, 0.001, MARK_RGBA) for x in marks_m)]:
+        at = [x, 0.0, scene.top_at(x) + lift]
+        spec.worldbody.add_geom(type=box, size=LINE_HALF_M, pos=at, rgba=color)
     bodies = [spec.worldbody.add_body(mocap=True) for _ in range(1, robot.model.njoints)]
     for number, part in enumerate(parts_of(robot)[0]):
         surface = dict(uservert=part.points.ravel(), userface=part.triangles.ravel())

@@ -297,20 +297,18 @@ def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -
 
 def describe_task(task: JumpTask) -> str:
     """The target in words, such as "1.00 m forward, CoM rise 0.50 m"."""
-    words = [f"{abs(task.distance_m):.2f} m {'forward' if task.distance_m >= 0 else 'backward'}"]
-    if task.side_m:
-        words.append(f"{abs(task.side_m):.2f} m to the {'left' if task.side_m > 0 else 'right'}")
-    words.append(f"CoM rise {task.height_m:.2f} m")
-    if task.yaw_rad:
-        words.append(f"turn {np.degrees(task.yaw_rad):.0f} deg")
-    if task.platform_m:
-        level = "higher" if task.platform_m > 0 else "lower"
-        words.append(f"landing {abs(task.platform_m):.2f} m {level}")
-    if task.rotation_rad:
-        words.append(f"rotation {np.degrees(task.rotation_rad):.0f} deg")
-    if task.run_up:
-        words.append(f"run-up of {task.run_up} step{'s' * (task.run_up > 1)}")
-    for word, feet in (("take-off from", task.takeoff), ("landing on", task.landing)):
-        if feet != "both":
-            words.append(f"{word} the {feet} foot")
-    return ", ".join(words)
+    way = "forward" if task.distance_m >= 0 else "backward"
+    side = "left" if task.side_m > 0 else "right"
+    level = "higher" if task.platform_m > 0 else "lower"
+    words = {
+        f"{abs(task.distance_m):.2f} m {way}": True,
+        f"{abs(task.side_m):.2f} m to the {side}": task.side_m,
+        f"CoM rise {task.height_m:.2f} m": True,
+        f"turn {np.degrees(task.yaw_rad):.0f} deg": task.yaw_rad,
+        f"landing {abs(task.platform_m):.2f} m {level}": task.platform_m,
+        f"rotation {np.degrees(task.rotation_rad):.0f} deg": task.rotation_rad,
+        f"run-up of {task.run_up} step{'s' * (task.run_up > 1)}": task.run_up,
+        f"take-off from the {task.takeoff} foot": task.takeoff != "both",
+        f"landing on the {task.landing} foot": task.landing != "both",
+    }
+    return ", ".join(text for text, said in words.items() if said)
