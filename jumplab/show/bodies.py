@@ -203,9 +203,12 @@ def five_link_points(
     toe = shaped(toe, (2,), "toe")
     angles = shaped(angles, (len(model.span),), "angles")
     tips = toe + np.cumsum(list(map(rotated, angles, model.span)), axis=0)
-    places = dict(zip(("ankle", "knee", "hip", "shoulder", "hand"), tips, strict=True))
-    com = toe + model.mass @ model.link_coms(angles) / model.total_mass
-    return places | {"toe": toe, "heel": toe + rotated(angles[0], model.heel), "com": com}
+    return {
+        **dict(zip(("ankle", "knee", "hip", "shoulder", "hand"), tips, strict=True)),
+        "toe": toe,
+        "heel": toe + rotated(angles[0], model.heel),
+        "com": toe + model.mass @ model.link_coms(angles) / model.total_mass,
+    }
 
 
 def draw_ground(
@@ -269,13 +272,20 @@ def _draw_joints(ax: Axes, robot: Robot, q: np.ndarray, top: float) -> None:
     model = robot.model
     places = Silhouette(robot, "front").joints(q)
     roles = {name: role for role, pair in robot.joints.items() for name in pair}
-    edge = dict(markeredgecolor=INK, markeredgewidth=0.6, marker="o")
     for joint, (name, place) in enumerate(places.items(), 2):
         start = places.get(model.names[model.parents[joint]], (0.0, q[2]))
         ax.plot(*zip(start, place, strict=True), color=BODY, linewidth=2.0, zorder=2)
         face = ROLE_COLORS.get(roles.get(name), "white")
         size = 6 if name in roles else 3.5
-        ax.plot(*place, markerfacecolor=face, markersize=size, zorder=10 - size, **edge)
+        ax.plot(
+            *place,
+            marker="o",
+            markersize=size,
+            markerfacecolor=face,
+            markeredgecolor=INK,
+            markeredgewidth=0.6,
+            zorder=10 - size,
+        )
     for role, pair in robot.joints.items():
         look = dict(va="center", fontsize=7, color=ROLE_COLORS[role])
         if pair:
@@ -294,6 +304,6 @@ def _draw_links(ax: Axes, robot: Robot, top: float) -> None:
     places = (points["toe"] + [0.0, 0.03 * top], *middles, points["hand"])
     for name, (x, z), mass in zip(SAGITTAL_LINKS, places, model.mass, strict=True):
         if mass > 0:
-            look = dict(va="center", fontsize=7, color="#444444")
-            ax.text(x + 0.06 * top, z, f"{name} {mass:.1f} kg", **look)
+            words = f"{name} {mass:.1f} kg"
+            ax.text(x + 0.06 * top, z, words, va="center", fontsize=7, color="#444444")
     draw_com(ax, points["com"])

@@ -198,10 +198,12 @@ def price_bars(prices: Prices) -> Figure:
     size = 1e3 if prices.unit == "m" else 180 / np.pi
     names = [f"{row.limit}, {row.step_words}" for row in rows]
     ax.barh(names, [size * row.price * row.step for row in rows], color=LAUNCH)
-    for kept, face in ((True, FLIGHT), (False, "white")):
+    look = dict(linestyle="none", marker="o", markersize=4, color=FLIGHT, zorder=3)
+    for kept, face, label in (
+        (True, FLIGHT, "with the limit moved"),
+        (False, "white", "the same, other limits bind"),
+    ):
         at = [(size * row.checked * row.step, k) for k, row in enumerate(rows) if row.stays == kept]
-        look = dict(linestyle="none", marker="o", markersize=4, color=FLIGHT, zorder=3)
-        label = "with the limit moved" if kept else "the same, other limits bind"
         ax.plot(*np.array(at).reshape(-1, 2).T, markerfacecolor=face, label=label, **look)
     ax.axvline(0, **LIMIT_STYLE)
     ax.legend(loc="best")

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jumplab.auditing.replay import runs
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.legs import size
@@ -34,7 +35,6 @@ from jumplab.show.style import (
     new_figure,
     panel_letters,
     phase_handles,
-    runs,
     shade,
     themed,
 )
@@ -139,12 +139,11 @@ def joint_trajectories(
         draw dashed, such as stage 2's; of a jump in the plane alone.
     """
     joints = _joints(tape, robot)
-    motors = robot.limits
     signs = {name: (row, sign) for name, row, sign in robot.role_signs()}
     fig = new_figure(PAGE_IN, 4.5 if torques else 3.1)
     axes = fig.subplots(3 if torques else 2, len(joints), sharex=True)
     for column, (title, sides) in zip(axes.T, joints.items(), strict=True):
-        motor = motors[sides[0]]
+        motor = robot.limits[sides[0]]
         panels = (
             (tape.q[:, 7:], (motor.lower, motor.upper)),
             (tape.v[:, 6:], (-motor.speed, motor.speed)),
@@ -274,7 +273,8 @@ def active(plan: JumpPlan, limits: Limits | None = None) -> Figure:
     for k, name in enumerate(names):
         for phase, color in PHASE_COLORS.items():
             used = rows[name] & (tape.phase == phase)
-            spans = [tape.t[run[0] : run[-1] + 2] for run in runs(used) if used[run[0]]]
+            parts = [part for part in runs(used) if used[part.start]]
+            spans = [tape.t[part.start : part.stop + 1] for part in parts]
             bars = [(span[0], np.ptp(span)) for span in spans]
             ax.broken_barh(bars, (k - 0.35, 0.7), facecolor=color, edgecolor=color, linewidth=0.8)
     mark_time(ax, (_heel_up_time(tape), tape.takeoff_time))
@@ -379,10 +379,11 @@ def _strip_rows(record: SimulationResult | Tape, height: np.ndarray) -> np.ndarr
     shares = FLIGHT_SHARES if len(pieces) < 4 else FLIGHT_SHARES[1:2]
     rows = []
     for piece in pieces:
-        if record.phase[piece[0]] == "flight":
-            rows += [piece[int(share * (len(piece) - 1))] for share in shares]
+        first, last = piece.start, piece.stop - 1
+        if record.phase[first] == "flight":
+            rows += [first + int(share * (last - first)) for share in shares]
         else:
-            rows += [piece[0], piece[np.argmin(height[piece])], piece[-1]]
+            rows += [first, first + np.argmin(height[piece]), last]
     return np.array(rows)
 
 

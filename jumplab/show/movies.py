@@ -82,12 +82,7 @@ class Movie:
         return write_file(path, self.data)
 
     def _repr_html_(self) -> str:
-        return filled(
-            "show/movie.html",
-            kind=self.kind,
-            type=KINDS[self.kind][0],
-            data=self.data,
-        )
+        return filled("show/movie.html", kind=self.kind, type=KINDS[self.kind][0], data=self.data)
 
 
 def movie(
@@ -135,8 +130,8 @@ def movie(
             words = f"{motion.t[k] - motion.t[0]:.2f} s, half speed"
             ImageDraw.Draw(picture).text((10, size[1] - 22), words, fill=INK)
             pictures.append(picture)
-    lasts_s = len(pictures) / RATES[kind]
-    return Movie(_encode(pictures, kind), kind, len(pictures), lasts_s, name)
+    count = len(pictures)
+    return Movie(_encode(pictures, kind), kind, count, count / RATES[kind], name)
 
 
 def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Scene]:
@@ -197,13 +192,19 @@ def write_movie(
 
 def _encode(pictures: Sequence[Image.Image], kind: str) -> bytes:
     if kind == "mp4":
-        coding = dict(codec="libx264", pixelformat="yuv420p", macro_block_size=2, fps=RATES[kind])
-        where = dict(extension=".mp4", plugin="FFMPEG")
-        return images.imwrite("<bytes>", np.stack(pictures), **where, **coding)
+        return images.imwrite(
+            "<bytes>",
+            np.stack(pictures),
+            extension=".mp4",
+            plugin="FFMPEG",
+            codec="libx264",
+            pixelformat="yuv420p",
+            macro_block_size=2,
+            fps=RATES[kind],
+        )
     some = np.vstack(pictures[:: max(1, len(pictures) // 6)])
     palette = Image.fromarray(some).quantize(COLORS)
-    plain = dict(palette=palette, dither=Image.Dither.NONE)
-    first, *others = (picture.quantize(**plain) for picture in pictures)
+    first, *others = (x.quantize(palette=palette, dither=Image.Dither.NONE) for x in pictures)
     pause = round(1000 / RATES[kind])  # [ms]
     buffer = io.BytesIO()
     first.save(buffer, "GIF", save_all=True, append_images=others, duration=pause, loop=0)
@@ -278,17 +279,25 @@ def _world(robot: Robot, scene: Scene, marks_m: Sequence[float]) -> mujoco.MjMod
     spec = mujoco.MjSpec.from_string(filled("show/world.xml"))
     box = mujoco.mjtGeom.mjGEOM_BOX
     for half, middle, turn in scene.within(*SHOWN_M, 4.0).boxes():
-        place = dict(size=half, pos=middle, quat=np.roll(turn, 1))
-        spec.worldbody.add_geom(type=box, material="floor", **place)
+        quat = np.roll(turn, 1)
+        spec.worldbody.add_geom(type=box, material="floor", size=half, pos=middle, quat=quat)
     lines = [(x, 0.0, LINE_RGBA) for x in marks_m[0] + np.arange(*SHOWN_M, LINE_M)]
     for x, lift, color in [*lines, *((x, 0.001, MARK_RGBA) for x in marks_m)]:
         at = [x, 0.0, scene.top_at(x) + lift]
         spec.worldbody.add_geom(type=box, size=LINE_HALF_M, pos=at, rgba=color)
     bodies = [spec.worldbody.add_body(mocap=True) for _ in range(1, robot.model.njoints)]
     for number, part in enumerate(parts_of(robot)[0]):
-        surface = dict(uservert=part.points.ravel(), userface=part.triangles.ravel())
-        shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open surfaces too
-        spec.add_mesh(name=f"{number}", inertia=shell, **surface)
-        look = dict(meshname=f"{number}", material=part.kind, contype=0, conaffinity=0)
-        bodies[part.joint - 1].add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, **look)
+        mesh = spec.add_mesh(
+            name=f"{number}",
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,  # open surfaces too
+            uservert=part.points.ravel(),
+            userface=part.triangles.ravel(),
+        )
+        bodies[part.joint - 1].add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=mesh.name,
+            material=part.kind,
+            contype=0,
+            conaffinity=0,
+        )
     return spec.compile()

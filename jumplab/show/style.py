@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jumplab.arguments import shaped
+from jumplab.auditing.replay import runs
 from jumplab.errors import InputError, quoted
 from jumplab.forms import filled
 from jumplab.io.folder import versions, write_file
@@ -171,17 +172,12 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
         raise InputError(f"phase {unknown[0]!r}: must be one of {', '.join(PHASE_COLORS)}")
     lines = []
     for rows in runs(phase):
-        look = {"color": PHASE_COLORS[str(phase[rows[0]])]} | kwargs
+        look = {"color": PHASE_COLORS[str(phase[rows.start])]} | kwargs
         try:
             lines += ax.plot(t[rows], y[rows], **look)
         except (AttributeError, TypeError, ValueError) as e:
             raise InputError(f"no line can look like {quoted(kwargs)}: {quoted(e)}") from None
     return lines
-
-
-def runs(values: np.ndarray) -> list[np.ndarray]:
-    """Rows of each run of equal ``values`` (n,), such as phases, in their order."""
-    return np.split(np.arange(len(values)), np.flatnonzero(values[1:] != values[:-1]) + 1)
 
 
 def compare(
@@ -236,8 +232,7 @@ def legend_above(fig: Figure, handles: list[Artist]) -> None:
 def panel_letters(axes: Iterable[Axes]) -> None:
     """(a), (b), ... before the panels' titles."""
     for letter, ax in zip("abcdefghijklmnop", axes, strict=False):
-        title = f"({letter}) {ax.get_title(loc='left')}"
-        ax.set_title(title.rstrip())
+        ax.set_title(f"({letter}) {ax.get_title(loc='left')}".rstrip())
 
 
 def bare(ax: Axes) -> None:
@@ -268,8 +263,9 @@ def save_figure(
     :class:`InputError` if ``name`` is not a plain file name, or the folder cannot be written.
     """
     if not name or Path(name).name != name or name.startswith("."):
-        must = "must be a plain file name without ending, such as 'f08_joints'"
-        raise InputError(f"figure name {name!r}: {must}")
+        raise InputError(
+            f"figure name {name!r}: must be a plain file name without ending, such as 'f08_joints'"
+        )
     png = file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
     fig.set_layout_engine("none")
     pdf = file_of(fig, "pdf", metadata=PDF_METADATA)
@@ -284,15 +280,21 @@ def save_figure(
 
 def made_with() -> str:
     """The installed packages that shape a result, with their versions."""
-    pairs = versions().items()
-    return ", ".join(f"{name} {number}" for name, number in pairs if number != "not installed")
+    return ", ".join(
+        f"{name} {number}" for name, number in versions().items() if number != "not installed"
+    )
 
 
 def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -> str:
     """Text of NAME.txt: caption, target (or targets), robot and versions, one line each."""
     tasks = [task] if isinstance(task, JumpTask) else task or ()
-    facts = {"robot": robot, "made_with": made_with(), "caption": caption.strip()}
-    return filled("show/caption.txt", tasks=[*map(describe_task, tasks)], **facts)
+    return filled(
+        "show/caption.txt",
+        caption=caption.strip(),
+        tasks=[*map(describe_task, tasks)],
+        robot=robot,
+        made_with=made_with(),
+    )
 
 
 def describe_task(task: JumpTask) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jumplab.arguments import checked
+from jumplab.auditing.replay import runs
 from jumplab.errors import InputError
 from jumplab.forms import filled
 from jumplab.io.folder import write_file
@@ -25,7 +26,7 @@ from jumplab.robot import Robot
 from jumplab.robot.files import LEG
 from jumplab.show.bodies import ABOVE_M
 from jumplab.show.shapes import PAINTS, Part, Trace, ground_forces, parts_of, trace
-from jumplab.show.style import PHASE_COLORS, describe_task, made_with, runs
+from jumplab.show.style import PHASE_COLORS, describe_task, made_with
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
 
@@ -158,7 +159,7 @@ def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, An
     motion = whole.every(FPS)
     forces = ground_forces(whole, FPS, way, scene)
     words = np.array(list(map(_words, motion.phase, motion.contact)))
-    cuts = [run[0] for run in runs(words)]
+    cuts = [part.start for part in runs(words)]
     return {
         "bodies": way.joints.shape[1],
         "frames": len(motion.t),
