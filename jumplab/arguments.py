@@ -28,7 +28,6 @@ if TYPE_CHECKING:  # help of a command is there before NumPy is
 F = TypeVar("F", bound=Callable)
 FLAGS = "bool", "bool_"
 RECEIVERS = "self", "cls"
-PLACES = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
 UNKNOWN = inspect.Parameter.empty  # an annotation that cannot be checked
 
 
@@ -86,18 +85,12 @@ def _checking(function: F) -> F:
     signature = inspect.signature(function)
     parameters = signature.parameters
     called = function.__qualname__.removesuffix(".__init__")
-    plain = all(x.kind in PLACES for x in parameters.values())
-    least = sum(x.default is UNKNOWN for x in parameters.values())
-    hints: dict[str, Any] = {}  # known once the function is called, after all imports
+    hints = {}  # known once the function is called, after all imports
 
     @wraps(function)
     def checking(*args: Any, **options: Any) -> Any:
         if not hints:
             hints.update({k: _hint(x.annotation, function) for k, x in parameters.items()})
-        # a control loop calls a thousand times for each simulated second
-        if plain and not options and least <= len(args) <= len(hints):
-            if all(map(_fits, args, hints.values())):
-                return function(*args)
         try:
             given = signature.bind(*args, **options)
         except TypeError as e:
@@ -116,19 +109,6 @@ def _checking(function: F) -> F:
         return function(*given.args, **given.kwargs)
 
     return checking
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """True where a look at the type shows that a value is already as its ``hint`` has it."""
-    if hint is UNKNOWN or hint is Any:
-        return True
-    if type(value) is not hint:
-        return False
-    if hint is float:
-        return math.isfinite(value)
-    if hint.__name__ == "ndarray":
-        return value.dtype.kind in "fiu" and value.ndim > 0
-    return hint in (int, bool, str) or hint.__module__.startswith("jumplab.")
 
 
 def _hint(annotation: Any, function: Callable) -> Any:

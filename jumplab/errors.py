@@ -110,14 +110,14 @@ class Shown:
 
     def line(self) -> str:
         """Summary in one line; by default its plain values, and the names of the rest."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        plain = [
-            f"{k}={x!r}"
-            for k, x in values.items()
-            if isinstance(x, str | int | float) and len(repr(x)) < 40
-        ]
-        rest = [k for k in values if not any(text.startswith(f"{k}=") for text in plain)]
-        return ", ".join([*plain, *rest])
+        plain, rest = [], []
+        for name in (f.name for f in fields(self)):
+            value = getattr(self, name)
+            if isinstance(value, str | int | float) and len(repr(value)) < 40:
+                plain.append(f"{name}={value!r}")
+            else:
+                rest.append(name)
+        return ", ".join(plain + rest)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.line()}>"

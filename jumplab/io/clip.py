@@ -195,16 +195,23 @@ def _first_wxyz(x: np.ndarray) -> np.ndarray:
 
 def _of_tracker(x: Mapping[str, Any]) -> _Raw:
     joints = x["joint_pos"]
-    world = not x["body_pos_w"][:, 0].any()
-    place, turn = (x[name][:, int(world)] for name in ("body_pos_w", "body_quat_w"))
-    words = "arrays of a motion tracker, quaternion w x y z"
-    root = joints.shape[1] - len(x["joint_names"]) if "joint_names" in x else 0
-    return _Raw(place, _first_wxyz(turn), joints[:, root:], words)
+    root = int(not x["body_pos_w"][:, 0].any())  # the world may be the first body
+    before = joints.shape[1] - len(x["joint_names"]) if "joint_names" in x else 0
+    return _Raw(
+        x["body_pos_w"][:, root],
+        _first_wxyz(x["body_quat_w"][:, root]),
+        joints[:, before:],
+        "arrays of a motion tracker, quaternion w x y z",
+    )
 
 
 def _of_states(x: Mapping[str, Any]) -> _Raw:
-    place, turn = (x[f"rigid_body_{name}"][:, 0] for name in ("pos", "rot"))
-    return _Raw(place, turn, x["dof_pos"], "states of all bodies, quaternion x y z w")
+    return _Raw(
+        x["rigid_body_pos"][:, 0],
+        x["rigid_body_rot"][:, 0],
+        x["dof_pos"],
+        "states of all bodies, quaternion x y z w",
+    )
 
 
 def _of_table(x: Mapping[str, Any]) -> _Raw:
@@ -219,13 +226,13 @@ def _of_animation(x: Mapping[str, Any]) -> _Raw:
         np.column_stack([x[f"root_{word}{axis}"] for axis in "XYZ"])
         for word in ("translate", "rotate")
     )
-    joints = [name for name in x if name.endswith("_dof")]
+    joints = {name.removesuffix("_dof"): x[name] for name in x if name.endswith("_dof")}
     return _Raw(
         place / 100,
         Rotation.from_euler("xyz", turn, degrees=True).as_quat(),
-        np.radians(np.column_stack([x[name] for name in joints])),
+        np.radians(np.column_stack([*joints.values()])),
         "an animator's table, cm and degrees",
-        names=tuple(name.removesuffix("_dof") for name in joints),
+        names=tuple(joints),
         usual_fps=120.0,
     )
 
@@ -348,9 +355,9 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
 def _faults(raw: _Raw) -> Iterator[str]:
     """Sentences on what makes arrays no motion in metres and radians, z up."""
     n = len(raw.base)
-    shapes = raw.base.shape == (n, 3) and raw.turn.shape == (n, 4)
-    if not shapes or raw.joints.ndim != 2 or len(raw.joints) != n:
-        sizes = f"{raw.base.shape}, {raw.turn.shape}, {raw.joints.shape}"
+    shapes = raw.base.shape, raw.turn.shape, raw.joints.shape
+    if shapes != ((n, 3), (n, 4), (n, *raw.joints.shape[-1:])):
+        sizes = ", ".join(map(str, shapes))
         yield (
             f"base, quaternions and joints have shapes {sizes}; they must be (n, 3), (n, 4), "
             f"(n, joints)"

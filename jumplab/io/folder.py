@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +37,6 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.task import GRAVITY
 
-T = TypeVar("T")
 Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
 # whose versions a result names; by the last three notebooks draw and pose their own programs
@@ -147,17 +146,20 @@ def versions() -> dict[str, str]:
 
 
 def to_json(data: Any) -> str:
-    """JSON of nested mappings, sequences, NumPy values, paths; null for what is not finite."""
-    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    """JSON of what is :func:`plain` of some data."""
+    return json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _plain(x: Any) -> Any:
+def plain(x: Any) -> Any:
+    """What JSON can hold of nested mappings, sequences, NumPy values, paths; None for what is not
+    finite.
+    """
     if isinstance(x, Mapping):
-        return {str(k): _plain(v) for k, v in x.items()}
+        return {str(k): plain(v) for k, v in x.items()}
     if isinstance(x, np.ndarray | np.generic):
-        return _plain(x.tolist())
+        return plain(x.tolist())
     if isinstance(x, list | tuple):
-        return [_plain(v) for v in x]
+        return [plain(v) for v in x]
     if isinstance(x, float):
         return x if math.isfinite(x) else None
     return str(x) if isinstance(x, Path) else x
@@ -174,8 +176,8 @@ def write_plan(
     tape: Tape,
     robot: Robot,
     summary: Summary,
-    complete: Callable[[Path], T] | None = None,
-) -> T | None:
+    complete: Callable[[Path], Any] | None = None,
+) -> Any:
     """Write a plan's folder; what an older plan left there, with its passport and simulation, goes.
 
     ``summary`` becomes ``summary.json``, with a ``manifest`` added: versions, robot, hashes of the

@@ -130,7 +130,7 @@ class Motion:
         With ``end`` its last instant follows, where it is none of the grid: touchdown, in a plan.
         """
         checked_rate(rate_hz)
-        count = int(np.floor((self.duration + END_TOLERANCE) * rate_hz)) + 1
+        count = int((self.duration + END_TOLERANCE) * rate_hz) + 1
         times = np.minimum(self.t[0] + np.arange(count) / rate_hz, self.t[-1])
         more = end and self.t[-1] - times[-1] > END_TOLERANCE
         return self.at(np.append(times, self.t[-1:] if more else []))

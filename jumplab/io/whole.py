@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, RobotError
+from jumplab.errors import InputError
 from jumplab.io.motion import Motion, steady
 from jumplab.robot import Robot
-from jumplab.robot.contact import Anchor, on_feet
+from jumplab.robot.contact import WORLD, Anchor, on_feet
 from jumplab.robot.files import entry, numbers, read_toml
 
 ORDERS = ("depth-first", "breadth-first")  # of links and joints: MuJoCo's and Isaac Lab's
@@ -47,17 +47,16 @@ class Whole:
             self.joints, self.links = ordered(self.urdf)
             self.model = pin.buildModelFromXML(self.urdf, pin.JointModelFreeFlyer())
         except (ValueError, AttributeError, KeyError, ElementTree.ParseError) as e:
-            raise RobotError(
-                f"robot {robot.name}: [published] holds no URDF: {str(e).splitlines()[0]}"
-            ) from e
+            raise robot.error(f"[published] holds no URDF: {str(e).splitlines()[0]}") from e
         self.model.gravity.linear = np.array([0.0, 0.0, -robot.gravity])
         self._data = self.model.createData()
         self._held = numbers(config, "published", "held")
-        trunk = entry(config, "published", "trunk", kind=str, default=self.links[0])
-        self._trunk = self._frame(trunk)
+        self._trunk = self._frame(
+            entry(config, "published", "trunk", kind=str, default=self.links[0])
+        )
         for name in (*robot.joint_names, *self._held):
             if name not in self.joints:
-                raise RobotError(f"robot {robot.name}: [published] lacks the joint {name!r}")
+                raise robot.error(f"[published] lacks the joint {name!r}")
         self.order = self._columns(self.joints)
         self._back = np.argsort(self.order)
         self._jumping = self._columns(robot.joint_names)
@@ -69,7 +68,7 @@ class Whole:
 
     def _frame(self, link: str) -> int:
         if not self.model.existFrame(link, pin.FrameType.BODY):
-            raise RobotError(f"robot {self.robot.name}: [published] lacks the link {link!r}")
+            raise self.robot.error(f"[published] lacks the link {link!r}")
         return self.model.getFrameId(link, pin.FrameType.BODY)
 
     def feet(self, point: np.ndarray) -> list[Anchor]:
@@ -104,15 +103,14 @@ class Whole:
         q[:, 7 + self._columns(self._held)] = [*self._held.values()]
         q[:, 7 + self._jumping] = x.q[:, 7:]
         v[:, 6 + self._jumping] = x.v[:, 6:]
-        for k, (qk, vk) in enumerate(zip(q, v, strict=True)):
+        for qk, vk, base, base_twist in zip(q, v, x.q[:, :7], x.v[:, :6], strict=True):
             # the root's state is that which gives the trunk its own
             pin.forwardKinematics(model, data, qk, vk)
             trunk = pin.updateFramePlacement(model, data, self._trunk)
-            twist = self._offset.actInv(pin.Motion(x.v[k, :6]))
+            twist = self._offset.actInv(pin.Motion(base_twist))
             twist -= pin.getFrameVelocity(model, data, self._trunk)
-            place = pin.XYZQUATToSE3(x.q[k, :7]) * self._offset * trunk.inverse()
-            q[k, :7] = pin.SE3ToXYZQUAT(place)
-            v[k, :6] = trunk.act(twist).vector
+            qk[:7] = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(base) * self._offset * trunk.inverse())
+            vk[:6] = trunk.act(twist).vector
         q[:, 3:7] = steady(q[:, 3:7])
         self._check_places(q[0], x.q[0])
         change = np.gradient(v, x.t, axis=0) if len(x.t) > 1 else np.zeros_like(v)
@@ -193,14 +191,13 @@ class Whole:
         data = self._data
         frames = [self._frame(name) for name in links]
         levers = [model.inertias[model.frames[i].parentJoint].lever * at_com for i in frames]
-        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         rows = []
         for q, v in zip(*self.states(x), strict=True):
             pin.forwardKinematics(model, data, q, v)
             pin.updateFramePlacements(model, data)
             for frame, lever in zip(frames, levers, strict=True):
                 pose = data.oMf[frame]
-                twist = pin.getFrameVelocity(model, data, frame, axes)
+                twist = pin.getFrameVelocity(model, data, frame, WORLD)
                 speed = twist.linear + np.cross(twist.angular, pose.rotation @ lever)
                 rows.append([*pin.SE3ToXYZQUAT(pose), *speed, *twist.angular])
         table = np.reshape(rows, (len(x.t), len(links), 13))
@@ -215,20 +212,20 @@ class Whole:
 
 def _sorted(rows: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Rows (F, n) whose last columns, the joints, are in another ``order`` (J,)."""
-    joints = rows[:, -len(order) :]
-    return np.hstack([rows[:, : -len(order)], joints[:, order]])
+    base, joints = np.split(rows, [-len(order)], axis=1)
+    return np.hstack([base, joints[:, order]])
 
 
 def ordered(urdf: str, order: str = ORDERS[0]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of joints and links of a URDF in one of :data:`ORDERS`, siblings as it lists them."""
     tree = ElementTree.fromstring(urdf)
     below = {link.get("name"): [] for link in tree.iterfind("link")}
-    children = set()
+    roots = list(below)
     for joint in tree.iterfind("joint"):
         parent, child = (joint.find(end).get("link") for end in ("parent", "child"))
         below[parent].append((joint.get("name"), child, joint.get("type")))
-        children.add(child)
-    waiting = [("", next(link for link in below if link not in children), "root")]
+        roots.remove(child)
+    waiting = [("", roots[0], "root")]
     moving = []
     while waiting:
         name, link, kind = waiting.pop(0)

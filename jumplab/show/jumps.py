@@ -6,6 +6,7 @@ bend in it, and the planar quantities of its tape; any other one has all of both
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,23 +63,23 @@ MOMENTUM, INERTIA = "$L$ [kg m$^2$/s]", "$\\rho$ [kg m$^2$]"
 PLANAR_CURVES = {
     INERTIA: ("rho", ...),
     MOMENTUM: ("L", ...),
-    "$v_x$ of the CoM [m/s]": ("com_velocity", (..., 0)),
-    "$v_z$ of the CoM [m/s]": ("com_velocity", (..., 1)),
+    "$v_x$ of the CoM [m/s]": ("com_velocity", 0),
+    "$v_z$ of the CoM [m/s]": ("com_velocity", 1),
 }
 # ... and of what is simulated too
 PLANAR_MOTION = {
-    "CoM $x$ [m]": ("com", (..., 0)),
-    "CoM $z$ [m]": ("com", (..., 2)),
+    "CoM $x$ [m]": ("com", 0),
+    "CoM $z$ [m]": ("com", 2),
     f"{MOMENTUM}, launch": ("planar_L", ...),
-    "CoM $v_x$ [m/s]": ("com_velocity", (..., 0)),
-    "CoM $v_z$ [m/s]": ("com_velocity", (..., 2)),
+    "CoM $v_x$ [m/s]": ("com_velocity", 0),
+    "CoM $v_z$ [m/s]": ("com_velocity", 2),
     INERTIA: ("planar_rho", ...),
 }
 
 
 def _components(label: str, name: str) -> dict[str, tuple]:
     """Curves of all three components of an array, which ``label`` calls "?"."""
-    return {label.replace("?", x): (name, (..., k)) for k, x in enumerate("xyz")}
+    return {label.replace("?", x): (name, k) for k, x in enumerate("xyz")}
 
 
 SPATIAL_CURVES = _components("$v_?$ of the CoM [m/s]", "com_velocity")
@@ -98,12 +99,12 @@ def _heel_up_time(tape: Tape) -> float:
 
 def _joints(tape: Tape, robot: Robot) -> dict[str, list[int]]:
     """The joints to show: their columns by title, of one joint or of a pair."""
-    columns: dict[str, list[int]] = {}
+    columns = defaultdict(list)
     in_plane = {name for pair in robot.joints.values() for name in pair}
     for i, name in enumerate(robot.joint_names):
         if name in in_plane or not _in_plane(tape):
             title = name.removeprefix("left_").removeprefix("right_").removesuffix("_joint")
-            columns.setdefault(title.replace("_", " "), []).append(i)
+            columns[title.replace("_", " ")].append(i)
     return columns
 
 
@@ -185,8 +186,8 @@ def inertia_and_momentum(tape: Tape) -> Figure:
     marks = (_heel_up_time(tape), takeoff)
     curves = {}
     for label, (name, part) in names.items():
-        asked = [(e[f"srmp_{p}_t"] + t, e[f"srmp_{p}_{name}"][part]) for p, t in starts.items()]
-        curves[label] = (tape.t, e[prefix + name][part], tape.phase), asked, marks
+        asked = [(e[f"srmp_{p}_t"] + t, e[f"srmp_{p}_{name}"].T[part]) for p, t in starts.items()]
+        curves[label] = (tape.t, e[prefix + name].T[part], tape.phase), asked, marks
     dashed = "stage 1, the reference" if starts else None
     return _panels(curves, phase_handles("launch", "flight", reference=dashed), 3.3)[0]
 
@@ -288,24 +289,23 @@ def active(plan: JumpPlan, limits: Limits | None = None) -> Figure:
 def _used_up(tape: Tape, robot: Robot, limits: Limits) -> dict[str, np.ndarray]:
     """Limit in words -> whether it is used up (N,), of the joints, the soles and the friction."""
     motors = robot.limits
-    speeds, torques = tape.v[:, 6:], tape.tau
-    least, most = (limits.torque_share * edge for edge in motors.range(speeds))
+    angles, speeds = tape.q[:, 7:], tape.v[:, 6:]
+    least, most = (FULL * limits.torque_share * edge for edge in motors.range(speeds))
     room = limits.range_margin_rad + NEAR_STOP_RAD
     by_limit = {
-        "torque": (torques >= FULL * most) | (torques <= FULL * least),
+        "torque": (tape.tau >= most) | (tape.tau <= least),
         "speed": np.abs(speeds) >= FULL * limits.speed_share * motors.speed,
-        "lower stop": tape.q[:, 7:] <= motors.lower + room,
-        "upper stop": tape.q[:, 7:] >= motors.upper - room,
+        "lower stop": angles <= motors.lower + room,
+        "upper stop": angles >= motors.upper - room,
     }
     rows = {}
     for title, sides in _joints(tape, robot).items():
         rows |= {f"{title}, {what}": used[:, sides].any(axis=1) for what, used in by_limit.items()}
     ground = ground_reaction(tape, robot)
     launch = tape.phase == "launch"
-    length = robot.foot.toe - robot.foot.heel
-    back = ground["cop_x"] + length - limits.cop_margin_m
+    heel = robot.foot.heel - robot.foot.toe + limits.cop_margin_m
     for what, used in {
-        "CoP at the heel": back <= NEAR_EDGE_M,
+        "CoP at the heel": ground["cop_x"] <= heel + NEAR_EDGE_M,
         "CoP at the toe": ground["cop_x"] >= -NEAR_EDGE_M,
         "friction": ground["friction"] >= FULL * limits.friction,
     }.items():
@@ -396,8 +396,8 @@ def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     """
     curves = {}
     for label, (name, part) in (PLANAR_MOTION if _in_plane(tape) else SPATIAL_MOTION).items():
-        actual = getattr(result, name.removeprefix("planar_"))[part]
-        planned = tape.extra[name][part]
+        actual = getattr(result, name.removeprefix("planar_")).T[part]
+        planned = tape.extra[name].T[part]
         seen = result.t <= tape.t[-1] + AFTER_TOUCHDOWN_S
         kept = slice(None)
         marks = [tape.takeoff_time]

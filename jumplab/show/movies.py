@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
     from jumplab.sim import SimulationResult
 
-KINDS = {"gif": ("image/gif", (480, 270)), "mp4": ("video/mp4", (848, 480))}  # type, size [pixels]
-RATES = {"gif": 20.0, "mp4": 30.0}  # frames a second
+# type, size [pixels], frames a second
+KINDS = {"gif": ("image/gif", (480, 270), 20.0), "mp4": ("video/mp4", (848, 480), 30.0)}
 LIBRARIES = {"egl": "MuJoCo, EGL", "osmesa": "MuJoCo, OSMesa"}  # of OpenGL without a display
 # how fast it is shown, and how much of the standing
 SPEED = 0.5
@@ -110,7 +110,8 @@ def movie(
     if kind not in KINDS:
         raise InputError(f"a movie must be one of {', '.join(KINDS)}, got {kind!r}")
     robot, record, scene = _subject(of, record, scene)
-    rate = RATES[kind] / SPEED
+    _, size, fps = KINDS[kind]
+    rate = fps / SPEED
     whole = Motion.of(record)
     motion = whole.every(rate)
     landing = motion.t[motion.phase == "landing"]
@@ -118,7 +119,6 @@ def movie(
     way = trace(robot, motion.q[shown])
     looks, distance_m = camera(way, rate)
     pressed = ground_forces(whole, rate, way, scene) if forces else None
-    size = KINDS[kind][1]
     pictures = []
     name, renderer = _renderer(_world(robot, scene, way.toes(robot)[[0, -1]].tolist()), size)
     with renderer:
@@ -131,7 +131,7 @@ def movie(
             ImageDraw.Draw(picture).text((10, size[1] - 22), words, fill=INK)
             pictures.append(picture)
     count = len(pictures)
-    return Movie(_encode(pictures, kind), kind, count, count / RATES[kind], name)
+    return Movie(_encode(pictures, kind, fps), kind, count, count / fps, name)
 
 
 def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Scene]:
@@ -190,7 +190,7 @@ def write_movie(
     return film
 
 
-def _encode(pictures: Sequence[Image.Image], kind: str) -> bytes:
+def _encode(pictures: Sequence[Image.Image], kind: str, fps: float) -> bytes:
     if kind == "mp4":
         return images.imwrite(
             "<bytes>",
@@ -200,12 +200,12 @@ def _encode(pictures: Sequence[Image.Image], kind: str) -> bytes:
             codec="libx264",
             pixelformat="yuv420p",
             macro_block_size=2,
-            fps=RATES[kind],
+            fps=fps,
         )
     some = np.vstack(pictures[:: max(1, len(pictures) // 6)])
     palette = Image.fromarray(some).quantize(COLORS)
     first, *others = (x.quantize(palette=palette, dither=Image.Dither.NONE) for x in pictures)
-    pause = round(1000 / RATES[kind])  # [ms]
+    pause = round(1000 / fps)  # [ms]
     buffer = io.BytesIO()
     first.save(buffer, "GIF", save_all=True, append_images=others, duration=pause, loop=0)
     return buffer.getvalue()

@@ -78,9 +78,7 @@ def _style(whole: bool) -> Iterator[None]:
         settings = {} if whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
         with plt.style.context(STYLE_FILE):
             larger = settings.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
-            for key in (key for key in TEXT_SIZES if key not in settings):
-                rcParams[key] *= larger
-            rcParams.update(settings)
+            rcParams.update({key: larger * rcParams[key] for key in TEXT_SIZES} | settings)
             yield
 
 
