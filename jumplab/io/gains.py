@@ -50,7 +50,7 @@ class Dynamics:
         self.data = self.model.createData()
         motors = [robot.actuators.get(name, {}) for name in self.model.names[2:]]
         self.model.armature[6:] = [motor.get("armature", 0.0) for motor in motors]
-        self._damping = np.array([motor.get("damping", 0.0) for motor in motors])
+        self._damping = np.array([0.0] * 6 + [motor.get("damping", 0.0) for motor in motors])
         self._tips = whole.feet(robot.foot.tip)
 
     def held(self, q: np.ndarray, carries: np.ndarray) -> Held:
@@ -66,8 +66,9 @@ class Dynamics:
 
     def jacobians(self, held: Held) -> list[np.ndarray]:
         """Rows (n, nv) of the twists of what is held, of each foot; of the last state."""
-        parts = (self.model, self.data)
-        return [pin.getFrameJacobian(*parts, *at, pin.LOCAL)[rows] for *at, rows in held]
+        return [
+            pin.getFrameJacobian(self.model, self.data, *at, pin.LOCAL)[rows] for *at, rows in held
+        ]
 
     def solved(self, jacobians: list[np.ndarray], right: np.ndarray) -> np.ndarray:
         """Accelerations, and contact forces with their sign turned (nv + rows, ...), of right-hand
@@ -85,7 +86,7 @@ class Dynamics:
         data = self.data
         pin.computeAllTerms(model, data, q, v)
         pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
-        push = np.concatenate([np.zeros(6), tau - self._damping * v[6:]]) - data.nle
+        push = np.pad(tau, (6, 0)) - self._damping * v - data.nle
         jacobians = self.jacobians(held)
         due = [
             -pin.getFrameAcceleration(model, data, *at, pin.LOCAL).vector[rows] - DAMPING * j @ v
@@ -109,7 +110,7 @@ class Dynamics:
             wrench[rows], forces = np.split(forces, [len(rows)])
             pushes[joint] += place.act(pin.Force(wrench))
         pin.computeRNEADerivatives(model, data, q, v, a, pushes)
-        by_rates = data.dtau_dv + np.diag([0.0] * 6 + [*self._damping])
+        by_rates = data.dtau_dv + np.diag(self._damping)
         right = [np.hstack([-data.dtau_dq, -by_rates, np.eye(nv)[:, 6:]])]
         pin.computeForwardKinematicsDerivatives(model, data, q, v, a)
         turns = [(data.oMi[joint] * place).rotation for joint, place, _ in held]

@@ -122,10 +122,8 @@ class Whole:
     def soles(self, q: np.ndarray) -> np.ndarray:
         """Corners (2, 4, 3) of the soles [m] at a configuration (nq,) of :meth:`frames`."""
         pin.forwardKinematics(self.model, self._data, _sorted(q[None], self._back)[0])
-        corners = [self.feet(corner) for corner in self.robot.foot.corners]
-        return np.swapaxes(
-            [[foot.place(self._data).translation for foot in feet] for feet in corners], 0, 1
-        )
+        places = [foot.place(self._data) for foot in self.feet(np.zeros(3))]
+        return np.array([[place.act(x) for x in self.robot.foot.corners] for place in places])
 
     def block(self, x: Motion) -> tuple[np.ndarray, np.ndarray, float] | None:
         """Half sizes (3,) and centre (3,) [m], and heading [rad], of a box on the lower of the two

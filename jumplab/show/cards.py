@@ -107,8 +107,15 @@ def _of_robot(robot: Robot) -> Card:
     for role, pair in robot.joints.items():
         row = {"role": role.replace("_", " "), "joints": ", ".join(pair) or "held"}
         rows.append(row | (dict(robot.actuators[pair[0]]) if pair else {}))
-    columns = {"role": "role", "joints": "joints", "lower": "from [rad]", "upper": "to [rad]"}
-    return table(rows, columns | {"effort": "N m", "speed": "rad/s"}), robot_sheet(robot)
+    columns = {
+        "role": "role",
+        "joints": "joints",
+        "lower": "from [rad]",
+        "upper": "to [rad]",
+        "effort": "N m",
+        "speed": "rad/s",
+    }
+    return table(rows, columns), robot_sheet(robot)
 
 
 def _of_audit(report: AuditReport) -> Card:
@@ -140,9 +147,16 @@ def _shares(report: AuditReport) -> Figure | None:
 
 
 def _of_clip(report: ClipReport) -> Card:
-    columns = {"name": "", "value": "found", "limit": "limit", "unit": "unit", "time": "at [s]"}
     rows = [vars(check) | {"passed": check.passed} for check in report.checks]
-    return table(rows, columns | {"passed": "passed"}), clip_sheet(report)
+    columns = {
+        "name": "",
+        "value": "found",
+        "limit": "limit",
+        "unit": "unit",
+        "time": "at [s]",
+        "passed": "passed",
+    }
+    return table(rows, columns), clip_sheet(report)
 
 
 @themed
@@ -168,22 +182,41 @@ def _of_mended(mended: Mended) -> Card:
 
 def _of_record(record: Record) -> Card:
     rows = [vars(limit) | {"worth": limit.worth} for limit in record.limits[:MOST_BINDING]]
-    columns = {"limit": "binds", "joint": "joint", "phase": "phase", "from_s": "from [s]"}
-    columns |= {"to_s": "to [s]", "worth": "worth of all of it"}
+    columns = {
+        "limit": "binds",
+        "joint": "joint",
+        "phase": "phase",
+        "from_s": "from [s]",
+        "to_s": "to [s]",
+        "worth": "worth of all of it",
+    }
     return table(rows, columns, digits=3), jump_strobe(record.plan.tape, record.plan.robot)
 
 
 def _of_improved(improved: Improved) -> Card:
-    columns = {"number": "number", "unit": "unit", "before": "was", "after": "becomes"}
-    columns |= {"low": "from", "high": "to", "buys": f"gain [{improved.after.unit}]"}
+    columns = {
+        "number": "number",
+        "unit": "unit",
+        "before": "was",
+        "after": "becomes",
+        "low": "from",
+        "high": "to",
+        "buys": f"gain [{improved.after.unit}]",
+    }
     rows = table([vars(x) for x in improved.changes], columns, digits=3)
     return rows, jump_strobe(improved.after.plan.tape, improved.robot)
 
 
 def _of_prices(prices: Prices) -> Card:
     rows = [vars(row) | {"gap": f"{row.gap:.1%}"} for row in prices.rows]
-    columns = {"limit": "limit", "unit": "for one", "price": f"gain [{prices.unit}]"}
-    columns |= {"checked": "with the limit moved", "gap": "differs", "stays": "same limits bind"}
+    columns = {
+        "limit": "limit",
+        "unit": "for one",
+        "price": f"gain [{prices.unit}]",
+        "checked": "with the limit moved",
+        "gap": "differs",
+        "stays": "same limits bind",
+    }
     return table(rows, columns, digits=3), price_bars(prices)
 
 

@@ -54,6 +54,7 @@ VISOR = np.array([[0.62, 0.0, 0.2], [0.45, 0.8, 0.3]])
 _CIRCLE = np.exp(1j * np.arange(16) * np.pi / 8)
 _HEIGHTS = np.exp(1j * np.linspace(-np.pi / 2, np.pi / 2, 9))
 BALL = np.array([(a.real * h.real, a.imag * h.real, h.imag) for h in _HEIGHTS for a in _CIRCLE])
+CORNERS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
 DISC = np.array([(a.real, side, a.imag) for side in (-1.0, 1.0) for a in _CIRCLE])
 
 
@@ -193,8 +194,7 @@ class _Box(NamedTuple):
     def rounded(self, share: float) -> np.ndarray:
         """Points (n, 3) of the box, the radius of its edges a ``share`` of the least width."""
         radius = share * 2 * self.half.min()
-        inner = zip(radius - self.half, self.half - radius, strict=True)
-        corners = np.array(list(itertools.product(*inner)))
+        corners = CORNERS * (self.half - radius)
         return placed(self.place, (corners[:, None] + radius * BALL).reshape(-1, 3))
 
     def inside(self, share: np.ndarray) -> np.ndarray:
@@ -286,8 +286,7 @@ def _trunk(robot: Robot, data: pin.Data, boxes: list[_Box]) -> Iterator[Part]:
     top = max(boxes, key=lambda box: box.middle[2])
     above = top.middle[2] - top.half[2] > shoulders - LIMB_M
     has_head = above and top.half.prod() < max(box.half.prod() for box in boxes)
-    middles = [box.middle for box in boxes]
-    yield _hull(1, "trunk", np.concatenate([x + LIMB_M * BALL for x in middles]))
+    yield _hull(1, "trunk", np.concatenate([box.middle + LIMB_M * BALL for box in boxes]))
     for box in boxes:
         head = has_head and box is top
         yield _hull(1, "trunk", box.rounded(HEAD_ROUNDING if head else ROUNDING))
