@@ -89,10 +89,11 @@ class Clip(Shown):
         robot = getattr(record, "robot", None) or robot
         if robot is None:
             raise InputError("the robot of this motion is unknown; pass it as robot=")
-        motion = Motion.of(getattr(record, "tape", record)).every(fps or RECORD_FPS)
-        clip = cls(motion.source, robot, motion.q, fps or RECORD_FPS, "a motion of this package")
-        task = getattr(record, "task", None)
-        return replace(clip, platform_m=task.platform_m) if task else clip
+        rate = fps or RECORD_FPS
+        motion = Motion.of(getattr(record, "tape", record)).every(rate)
+        platform_m = getattr(getattr(record, "task", None), "platform_m", 0.0)
+        origin = "a motion of this package"
+        return cls(motion.source, robot, motion.q, rate, origin, platform_m=platform_m)
 
 
 @dataclass
@@ -347,7 +348,7 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
         tilt = _check_order(where, raw, robot, q, order)
         if tilt > LYING_RAD:
             notes.append(f"with them the lower sole is {tilt:.1f} rad off level half of the time")
-    q = np.hstack([q[:, :3], steady(q[:, 3:7]), q[:, 7:]])
+    q[:, 3:7] = steady(q[:, 3:7])
     _check_joints(where, robot, q)
     return Clip(name, robot, q, rate, raw.origin, tuple(notes))
 

@@ -48,7 +48,7 @@ PLAN = "plan.npz"
 URDF = "robot.urdf"
 CONFIG = "robot.toml"
 SUMMARY = "summary.json"
-HASHED = (PLAN, URDF, CONFIG)
+HASHED = {PLAN: "arrays", URDF: "robot", CONFIG: "robot"}  # and their kinds
 # of exports: name of the format -> file or folder, frames a second that its usual readers expect
 FORMATS = {
     "csv": ("joints.csv", 1000.0),
@@ -294,7 +294,7 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
             summary = _read_summary(folder)
             files = {
                 name: reading.content(folder / name, kind, link=False)
-                for name, kind in zip(HASHED, ("arrays", "robot", "robot"), strict=True)
+                for name, kind in HASHED.items()
             }
             for name, raw in files.items():
                 if hashlib.sha256(raw).hexdigest() != summary["manifest"]["files"][name]:

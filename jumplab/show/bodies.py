@@ -168,9 +168,8 @@ def film_strip(
 ) -> None:
     """Frames (n, nq), CoM at ``places`` (n,) [m], times (n,) [s] below the ground."""
     frames = shaped(frames, (None, body.robot.model.nq), "frames")
-    times, places = (
-        shaped(x, (len(frames),), name) for x, name in ((times, "times"), (places, "places"))
-    )
+    times = shaped(times, (len(frames),), "times")
+    places = shaped(places, (len(frames),), "places")
     strobe(ax, body, frames, colors, shifts=places - [body.com(q)[0] for q in frames])
     for place, t in zip(places, times, strict=True):
         ax.text(place, -BELOW_M, f"{t:.2f} s", ha="center", va="top", fontsize=7)

@@ -165,8 +165,7 @@ def clip_sheet(report: ClipReport) -> Figure:
     fig = new_figure(PAGE_IN, 4.2)
     axes = fig.subplots(len(report.series), 1, sharex=True)
     for ax, (label, values) in zip(axes, report.series.items(), strict=True):
-        columns = values.T if values.ndim == 2 else [values]
-        for column, opacity in zip(columns, (1.0, 0.45), strict=False):
+        for column, opacity in zip(np.atleast_2d(values.T), (1.0, 0.45), strict=False):
             ax.plot(report.clip.t, column, color=LAUNCH, alpha=opacity)
         for begin, end in report.flights:
             ax.axvspan(begin, end, color=FLIGHT, alpha=0.2, linewidth=0)

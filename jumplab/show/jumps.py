@@ -398,13 +398,10 @@ def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     for label, (name, part) in (PLANAR_MOTION if _in_plane(tape) else SPATIAL_MOTION).items():
         actual = getattr(result, name.removeprefix("planar_")).T[part]
         planned = tape.extra[name].T[part]
-        seen = result.t <= tape.t[-1] + AFTER_TOUCHDOWN_S
-        kept = slice(None)
-        marks = [tape.takeoff_time]
-        if label.endswith("launch"):
-            seen = result.phase == "launch"
-            kept = tape.phase == "launch"
-            marks = []
+        launch = label.endswith("launch")
+        seen = result.phase == "launch" if launch else result.t <= tape.t[-1] + AFTER_TOUCHDOWN_S
+        kept = tape.phase == "launch" if launch else slice(None)
+        marks = [] if launch else [tape.takeoff_time]
         curve = (result.t[seen], actual[seen], result.phase[seen])
         curves[label] = curve, [(tape.t[kept], planned[kept])], marks
     fig, axes = _panels(curves, phase_handles(*PHASE_COLORS, reference="plan"), 3.4)

@@ -202,7 +202,7 @@ class _Box(NamedTuple):
         return placed(self.place, share * self.half)
 
 
-def _boxes(robot: Robot) -> list[_Box]:
+def _boxes(robot: Robot) -> Iterator[_Box]:
     """The boxes around the shapes of a robot's URDF; none if these are meshes.
 
     Raises :class:`RobotError` if Pinocchio cannot read the shapes.
@@ -211,15 +211,13 @@ def _boxes(robot: Robot) -> list[_Box]:
         geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.VISUAL)
     except ValueError as e:
         if "mesh" in str(e).lower():
-            return []
+            return
         raise robot.error(f"Pinocchio cannot read its shapes: {str(e).splitlines()[0]}") from e
-    boxes = []
     for shape in geometry.geometryObjects:
         shape.geometry.computeLocalAABB()
         box = shape.geometry.aabb_local
         place = shape.placement * pin.SE3(np.eye(3), (box.max_ + box.min_) / 2)
-        boxes.append(_Box(shape.parentJoint, place, (box.max_ - box.min_) / 2))
-    return boxes
+        yield _Box(shape.parentJoint, place, (box.max_ - box.min_) / 2)
 
 
 def rounded_body(robot: Robot) -> list[Part]:

@@ -165,7 +165,8 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
 
     ``phase`` holds names of :data:`PHASE_COLORS`; further keywords go to ``Axes.plot``.
     """
-    t, y = (shaped(x, (len(phase),), name) for x, name in ((t, "t"), (y, "y")))
+    t = shaped(t, (len(phase),), "t")
+    y = shaped(y, (len(phase),), "y")
     if unknown := sorted({*map(str, phase)} - {*PHASE_COLORS}):
         raise InputError(f"phase {unknown[0]!r}: must be one of {', '.join(PHASE_COLORS)}")
     lines = []
@@ -216,10 +217,9 @@ def phase_handles(
     *phases: str, reference: str | None = None, limit: str | None = None
 ) -> list[Line2D]:
     """Legend entries: phases by name, then texts (if any) for dashed reference and thin limits."""
-    handles = [Line2D([], [], color=PHASE_COLORS[p], label=p) for p in phases]
-    for text, look in ((reference, REFERENCE_STYLE), (limit, LIMIT_STYLE)):
-        handles += [Line2D([], [], **look, label=text)] if text else []
-    return handles
+    looks = {phase: {"color": PHASE_COLORS[phase]} for phase in phases}
+    looks |= {reference: REFERENCE_STYLE, limit: LIMIT_STYLE}
+    return [Line2D([], [], **look, label=text) for text, look in looks.items() if text]
 
 
 def legend_above(fig: Figure, handles: list[Artist]) -> None:
