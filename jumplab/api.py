@@ -103,15 +103,8 @@ def plan(
     from jumplab.studies.advice import plan_or_advise
 
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
-    changes = dict(
-        terms=terms,
-        weights=weights,
-        off=off,
-        limits=limits,
-        settings=settings,
-        mesh=mesh,
-        atlas=atlas,
-    )
+    changes = dict(terms=terms, weights=weights, off=off, limits=limits, settings=settings)
+    changes |= dict(mesh=mesh, atlas=atlas)
     if (task is None) == (contacts is None):
         raise InputError(
             "give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)"
