@@ -27,7 +27,6 @@ if TYPE_CHECKING:  # help of a command is there before NumPy is
 
 F = TypeVar("F", bound=Callable)
 FLAGS = "bool", "bool_"
-RECEIVERS = "self", "cls"
 UNKNOWN = inspect.Parameter.empty  # an annotation that cannot be checked
 
 
@@ -94,7 +93,7 @@ def _checking(function: F) -> F:
         try:
             given = signature.bind(*args, **options)
         except TypeError as e:
-            names = ", ".join(name for name in parameters if name not in RECEIVERS)
+            names = ", ".join(name for name in parameters if name not in ("self", "cls"))
             raise InputError(f"{called}: {e}; it takes {names or 'nothing'}") from None
         for name, value in given.arguments.items():
             parameter = parameters[name]

@@ -30,8 +30,12 @@ MOST_UNPACKED_BYTES = 800_000_000  # of all arrays of a file together
 MOST_ARRAYS = 1000  # in one file
 MOST_TAGS = 100_000  # of an XML text; the largest published robot has some 5000
 # elements of an MJCF that make copies or points: attributes that say how many, and the most
-COPYING = dict.fromkeys(("replicate", "composite", "flexcomp"), (("count",), 1000))
-COPYING |= {"hfield": (("nrow", "ncol"), 4_000_000)}
+COPYING = {
+    "replicate": ("count", 1000),
+    "composite": ("count", 1000),
+    "flexcomp": ("count", 1000),
+    "hfield": ("nrow ncol", 4_000_000),
+}
 INCLUDING = ("include", "model")  # elements of an MJCF that name another one
 # [bytes] of a file, by what it is: several times the largest that this package or a publisher of
 # robots makes; in words; what to do
@@ -137,7 +141,7 @@ def check_mjcf(
     for element, copies in todo:
         if element.tag in COPYING:
             names, most = COPYING[element.tag]
-            words = " ".join(element.get(name, "") for name in names).split()
+            words = " ".join(element.get(name, "") for name in names.split()).split()
             copies *= math.prod(int(x) for x in words if x.isdecimal())
             if copies > most:
                 raise error(

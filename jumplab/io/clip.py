@@ -45,11 +45,10 @@ ARRAYS = {
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
     ("_codecs", "encode"),
-    *(
-        (f"numpy.{core}.multiarray", x)
-        for core in ("core", "_core")
-        for x in ("_reconstruct", "scalar")
-    ),
+    ("numpy.core.multiarray", "_reconstruct"),
+    ("numpy.core.multiarray", "scalar"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
 }
 
 

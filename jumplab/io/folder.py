@@ -40,8 +40,8 @@ from jumplab.task import GRAVITY
 Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
 # whose versions a result names; by the last three notebooks draw and pose their own programs
-PACKAGES = ("jumplab", "casadi", "pin", "proxsuite", "coal", "pybullet", "mujoco", "numpy", "scipy")
-PACKAGES += ("matplotlib", "cvxpy", "clarabel")
+PACKAGES = """jumplab casadi pin proxsuite coal pybullet mujoco numpy scipy matplotlib cvxpy
+    clarabel""".split()
 # the same sources, built for later Pythons under another name
 BUILDS = {"pybullet-arm64": "pybullet"}
 PLAN = "plan.npz"
@@ -74,10 +74,21 @@ MESHES = tuple(FORMATS[name][0].removesuffix(".npz") + MESH for name in WITH_OBJ
 EXPORTS = (*(file for file, _ in FORMATS.values()), *MESHES)
 # what a new simulation makes untrue and therefore removes, and what a new plan does
 OF_SIMULATION = ("jump.html", *(f"simulated_{name}" for name in EXPORTS))
-TRIALS = ("trials.jsonl", "trials.json", "basin.json", "margins.json")
-RESULTS = ("passport.json", "simulation.npz", "simulation.json", *TRIALS)
 CERTIFICATE = ("certificate.json", "certificate.html")
-OF_PLAN = (SUMMARY, "plan.html", *RESULTS, *CERTIFICATE, *EXPORTS, *OF_SIMULATION)
+OF_PLAN = (
+    SUMMARY,
+    "plan.html",
+    "passport.json",
+    "simulation.npz",
+    "simulation.json",
+    "trials.jsonl",
+    "trials.json",
+    "basin.json",
+    "margins.json",
+    *CERTIFICATE,
+    *EXPORTS,
+    *OF_SIMULATION,
+)
 _STAGING = ".staging"
 _COMMIT = ".commit"
 

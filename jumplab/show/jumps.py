@@ -82,8 +82,10 @@ def _components(label: str, name: str) -> dict[str, tuple]:
     return {label.replace("?", x): (name, k) for k, x in enumerate("xyz")}
 
 
-SPATIAL_CURVES = _components("$v_?$ of the CoM [m/s]", "com_velocity")
-SPATIAL_CURVES |= _components("$L_?$ [kg m$^2$/s]", "angular_momentum")
+SPATIAL_CURVES = {
+    **_components("$v_?$ of the CoM [m/s]", "com_velocity"),
+    **_components("$L_?$ [kg m$^2$/s]", "angular_momentum"),
+}
 SPATIAL_MOTION = _components("CoM $?$ [m]", "com") | _components("CoM $v_?$ [m/s]", "com_velocity")
 
 

@@ -55,8 +55,8 @@ BAND = (0.928, 0.928, 0.928)  # fill of what is allowed between two bounds
 # keywords of Axes.annotate
 NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}
 # of the style, in points: they grow with a font.size of the user's
-TEXT_SIZES = [f"{of}.labelsize" for of in ("axes", "xtick", "ytick")]
-TEXT_SIZES += ["axes.titlesize", "legend.fontsize"]
+TEXT_SIZES = """axes.labelsize xtick.labelsize ytick.labelsize axes.titlesize
+    legend.fontsize""".split()
 STYLE_FILE = Path(__file__).with_name("jumplab.mplstyle")
 
 

@@ -172,13 +172,8 @@ def _words(phase: str, contact: np.ndarray) -> str:
 
 def _part(part: Part) -> dict[str, Any]:
     """A surface, its joint counted from the base on."""
-    return {
-        "joint": part.joint - 1,
-        "kind": part.kind,
-        "faceted": part.faceted,
-        "points": _packed(part.points),
-        "triangles": _packed(part.triangles),
-    }
+    packed = {name: _packed(getattr(part, name)) for name in ("points", "triangles")}
+    return vars(part) | packed | {"joint": part.joint - 1}
 
 
 def _packed(values: np.ndarray) -> str:
