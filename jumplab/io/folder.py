@@ -157,12 +157,12 @@ def versions() -> dict[str, str]:
 
 
 def to_json(data: Any) -> str:
-    """JSON of what is :func:`plain` of some data."""
+    """JSON of :func:`plain` data."""
     return json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def plain(x: Any) -> Any:
-    """What JSON can hold of nested mappings, sequences, NumPy values, paths; None for what is not
+    """Plain data for JSON of nested mappings, sequences, NumPy values, paths; None for what is not
     finite.
     """
     if isinstance(x, Mapping):

@@ -83,7 +83,7 @@ class Silhouette:
             ]
 
     def _left(self, part: Part) -> float:
-        """How far to the left a part is [m]."""
+        """Place of a part along y [m]."""
         return self._data.oMi[part.joint].act(part.points.mean(axis=0))[1]
 
     def outlines(self, q: np.ndarray) -> list[tuple[str, np.ndarray]]:
