@@ -14,7 +14,8 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
-from functools import lru_cache, wraps
+from contextlib import suppress
+from functools import cache, wraps
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -26,16 +27,14 @@ if TYPE_CHECKING:  # help of a command is there before NumPy is
 
 F = TypeVar("F", bound=Callable)
 FLAGS = "bool", "bool_"
-RECEIVERS = "self", "cls"
-PLACES = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
 UNKNOWN = inspect.Parameter.empty  # an annotation that cannot be checked
 
 
 def real(value: Any, what: str, unit: str = "") -> float:
     """A finite real number; raises :class:`InputError`, which calls it ``what``, in ``unit``."""
-    if _is(value, "ndarray") and value.ndim == 0:
+    if type(value).__name__ == "ndarray" and value.ndim == 0:
         value = value[()]
-    if _is(value, *FLAGS) or not isinstance(value, Real):
+    if isinstance(value, bool) or not isinstance(value, Real):
         raise InputError(
             f"{what} must be a number{f' in {unit}' * bool(unit)}, got {quoted(value)}"
         )
@@ -83,30 +82,22 @@ def checked(of: F) -> F:
 
 def _checking(function: F) -> F:
     signature = inspect.signature(function)
+    parameters = signature.parameters
     called = function.__qualname__.removesuffix(".__init__")
-    places = [x for x in signature.parameters.values() if x.kind in PLACES]
-    least = sum(x.default is UNKNOWN for x in places)
-    needed = any(
-        x.kind not in PLACES and x.default is UNKNOWN for x in signature.parameters.values()
-    )
-    hints: list[Any] = []
+    hints = {}  # known once the function is called, after all imports
 
     @wraps(function)
     def checking(*args: Any, **options: Any) -> Any:
-        # a control loop calls a thousand times for each simulated second
-        if not options and not needed and least <= len(args) <= len(places):
-            if not hints:
-                hints.extend(_hint(x.annotation, function) for x in places)
-            if all(map(_fits, args, hints)):
-                return function(*args)
+        if not hints:
+            hints.update({k: _hint(x.annotation, function) for k, x in parameters.items()})
         try:
             given = signature.bind(*args, **options)
         except TypeError as e:
-            names = ", ".join(name for name in signature.parameters if name not in RECEIVERS)
+            names = ", ".join(name for name in parameters if name not in ("self", "cls"))
             raise InputError(f"{called}: {e}; it takes {names or 'nothing'}") from None
         for name, value in given.arguments.items():
-            parameter = signature.parameters[name]
-            hint = _hint(parameter.annotation, function)
+            parameter = parameters[name]
+            hint = hints[name]
             default = parameter.default
             if parameter.kind is parameter.VAR_KEYWORD:
                 given.arguments[name] = {k: fitting(x, hint, k) for k, x in value.items()}
@@ -119,45 +110,25 @@ def _checking(function: F) -> F:
     return checking
 
 
-def _fits(value: Any, hint: Any) -> bool:
-    """True where a look at the type shows that a value is already as its ``hint`` has it."""
-    if hint is UNKNOWN or hint is Any:
-        return True
-    if type(value) is not hint:
-        return False
-    if hint is float:
-        return math.isfinite(value)
-    if hint.__name__ == "ndarray":
-        return value.dtype.kind in "fiu" and value.ndim > 0
-    return hint in (int, bool, str) or hint.__module__.startswith("jumplab.")
-
-
 def _hint(annotation: Any, function: Callable) -> Any:
     """An annotation as an object; :data:`UNKNOWN` if its names are not to be had at run time."""
     if not isinstance(annotation, str):
         return annotation
-    return _evaluated(annotation, inspect.unwrap(function))
+    module = sys.modules[inspect.unwrap(function).__module__]
+    with suppress(NameError):
+        return eval(annotation, vars(module))  # of this package's own sources
+    with suppress(NameError, ImportError):
+        return eval(annotation, _with_types(module))
+    return UNKNOWN
 
 
-@lru_cache(1000)
-def _evaluated(annotation: str, function: Callable) -> Any:
-    names = function.__globals__
-    try:
-        return eval(annotation, names)  # of this package's own sources
-    except NameError:
-        pass
-    try:
-        return eval(annotation, _with_types(names))
-    except (NameError, ImportError):
-        return UNKNOWN
-
-
-def _with_types(names: Mapping[str, Any]) -> dict[str, Any]:
-    """A module's ``names``, and those that it imports for type checkers alone."""
-    out = dict(names)
-    for block in ast.parse(inspect.getsource(sys.modules[names["__name__"]])).body:
+@cache
+def _with_types(module: types.ModuleType) -> dict[str, Any]:
+    """A module's names, and those that it imports for type checkers alone."""
+    out = dict(vars(module))
+    for block in ast.parse(inspect.getsource(module)).body:
         if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
-            exec(compile(ast.Module(block.body, []), names["__name__"], "exec"), out)
+            exec(compile(ast.Module(block.body, []), module.__name__, "exec"), out)
     return out
 
 
@@ -171,8 +142,6 @@ def fitting(value: Any, hint: Any, what: str) -> Any:
         return _array(value, what)
     if hint is getattr(sys.modules.get("numpy.typing"), "ArrayLike", UNKNOWN):
         return value if isinstance(value, Real) else _array(value, what)
-    if hint is None or hint is types.NoneType:
-        return _of(value, types.NoneType, what, "None")
     origin = typing.get_origin(hint)
     inner = typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
@@ -195,10 +164,8 @@ def fitting(value: Any, hint: Any, what: str) -> Any:
         items = [fitting(x, inner[0], f"an entry of {what}") for x in _items(value, what)]
         return items if origin is list else tuple(items)
     if isinstance(hint, type):
-        try:
+        with suppress(TypeError):  # a protocol that is not for run time
             return _of(value, hint, what, f"a {hint.__name__}")
-        except TypeError:  # a protocol that is not for run time
-            return value
     return value
 
 
@@ -219,11 +186,6 @@ def _one_of(value: Any, hints: tuple, what: str) -> Any:
     raise InputError(next((w for w in wanted if "must be None" not in w), wanted[0]))
 
 
-def _is(value: Any, *names: str) -> bool:
-    """Whether a value is of one of these types, NumPy's among them."""
-    return type(value).__name__ in names
-
-
 def _of(value: Any, kind: type, what: str, words: str) -> Any:
     if not isinstance(value, kind):
         raise InputError(f"{what} must be {words}, got {quoted(value)}")
@@ -231,13 +193,13 @@ def _of(value: Any, kind: type, what: str, words: str) -> Any:
 
 
 def _whole(value: Any, what: str) -> int:
-    if _is(value, *FLAGS) or not isinstance(value, Integral):
+    if isinstance(value, bool) or not isinstance(value, Integral):
         raise InputError(f"{what} must be a whole number, got {quoted(value)}")
     return int(value)
 
 
 def _flag(value: Any, what: str) -> bool:
-    if not _is(value, *FLAGS):
+    if type(value).__name__ not in FLAGS:
         raise InputError(f"{what} must be True or False, got {quoted(value)}")
     return bool(value)
 
@@ -269,4 +231,5 @@ SIMPLE = {
     bool: _flag,
     str: lambda value, what: _of(value, str, what, "a text"),
     Path: as_path,
+    types.NoneType: lambda value, what: _of(value, types.NoneType, what, "None"),
 }

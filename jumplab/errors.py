@@ -26,9 +26,10 @@ class JumplabError(Exception):
 
     exit_code = 4
 
-    def __init__(self, message: str):
+    def __init__(self, message: str, **facts: Any):
         # a value of thousands of characters is not quoted whole, wherever it comes from
         super().__init__(_ENDLESS.sub(lambda word: f"{word[0][:60]}...{word[0][-60:]}", message))
+        vars(self).update(facts)  # of those that the class names
 
 
 class InputError(JumplabError):
@@ -44,45 +45,25 @@ class RobotError(InputError):
 class InfeasibleError(JumplabError):
     """The question is well posed, but this robot cannot do it (or no plan was found within the
     limits).
-
-    ``number`` names what of the target is beyond its limit ("distance_m"), ``bound`` the limit [m].
     """
 
     exit_code = 3
-
-    def __init__(self, message: str, *, number: str = "", bound: float | None = None):
-        super().__init__(message)
-        self.number = number
-        self.bound = bound
+    number = ""  # what of the target is beyond its limit, such as "distance_m"
+    bound: float | None = None  # the limit [m]
 
 
 class SolverError(JumplabError):
-    """A solver stopped without an answer that passes its own re-evaluated residuals.
-
-    ``stage`` names the stage that failed, ``status`` is what the solver said after how many
-    ``iterations``, and ``violations`` are the worst violated terms, each as "name: amount unit at
-    node k, t = ... s". ``limits`` are those that hold back the best compromise, if one was looked
-    for, as :func:`jumplab.ocp.posing.binding` has them.
-    """
+    """A solver stopped without an answer that passes its own re-evaluated residuals."""
 
     exit_code = 3
-
-    def __init__(
-        self,
-        message: str,
-        *,
-        stage: str = "",
-        status: str = "",
-        violations: tuple[str, ...] = (),
-        iterations: int = 0,
-        limits: tuple = (),
-    ):
-        super().__init__(message)
-        self.stage = stage
-        self.status = status
-        self.violations = violations
-        self.iterations = iterations
-        self.limits = limits
+    stage = ""  # that failed
+    status = ""  # what the solver said, after how many iterations
+    iterations = 0
+    # the worst violated terms, each as "name: amount unit at node k, t = ... s"
+    violations: tuple[str, ...] = ()
+    # those that hold back the best compromise, if one was looked for, as
+    # :func:`jumplab.ocp.posing.binding` has them
+    limits: tuple = ()
 
 
 def quoted(value: Any) -> str:
@@ -129,14 +110,14 @@ class Shown:
 
     def line(self) -> str:
         """Summary in one line; by default its plain values, and the names of the rest."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        plain = [
-            f"{k}={x!r}"
-            for k, x in values.items()
-            if isinstance(x, str | int | float) and len(repr(x)) < 40
-        ]
-        rest = [k for k in values if not any(text.startswith(f"{k}=") for text in plain)]
-        return ", ".join([*plain, *rest])
+        plain, rest = [], []
+        for name in (f.name for f in fields(self)):
+            value = getattr(self, name)
+            if isinstance(value, str | int | float) and len(repr(value)) < 40:
+                plain.append(f"{name}={value!r}")
+            else:
+                rest.append(name)
+        return ", ".join(plain + rest)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.line()}>"

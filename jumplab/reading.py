@@ -29,9 +29,13 @@ LINE_BYTES = 20_000_000  # of a log, which is read line by line
 MOST_UNPACKED_BYTES = 800_000_000  # of all arrays of a file together
 MOST_ARRAYS = 1000  # in one file
 MOST_TAGS = 100_000  # of an XML text; the largest published robot has some 5000
-MOST_COPIES = 1000  # that an MJCF file asks for
-MOST_POINTS = 4_000_000  # of a height field
-COPYING = ("replicate", "composite", "flexcomp")
+# elements of an MJCF that make copies or points: attributes that say how many, and the most
+COPYING = {
+    "replicate": ("count", 1000),
+    "composite": ("count", 1000),
+    "flexcomp": ("count", 1000),
+    "hfield": ("nrow ncol", 4_000_000),
+}
 INCLUDING = ("include", "model")  # elements of an MJCF that name another one
 # [bytes] of a file, by what it is: several times the largest that this package or a publisher of
 # robots makes; in words; what to do
@@ -71,7 +75,7 @@ def opened(
     """
     if not link:
         refuse_link(path)
-    flags = os.O_RDONLY | (SAFE & ~os.O_NOFOLLOW if link else SAFE)
+    flags = SAFE & ~os.O_NOFOLLOW if link else SAFE
     with os.fdopen(os.open(path, flags), "rb") as file:
         check(file, path, kind, error)
         yield file
@@ -134,22 +138,19 @@ def check_mjcf(
     except (OSError, ElementTree.ParseError):
         return
     todo = [(root, 1)]
-    for element, above in todo:
-        get = element.get
-        numbers = [get("count")] if element.tag in COPYING else []
-        numbers += [get("nrow"), get("ncol")] if element.tag == "hfield" else []
-        copies = math.prod(
-            int(x) for text in numbers for x in (text or "").split() if x.isdecimal()
-        )
-        most = MOST_POINTS if element.tag == "hfield" else MOST_COPIES
-        if above * copies > most:
-            raise error(
-                f"{path.name}: <{element.tag}> makes {above * copies:.3g} copies or points, at "
-                f"most {most} are read; remove it, or ask for fewer"
-            )
-        todo += [(child, above * copies) for child in element]
+    for element, copies in todo:
+        if element.tag in COPYING:
+            names, most = COPYING[element.tag]
+            words = " ".join(element.get(name, "") for name in names.split()).split()
+            copies *= math.prod(int(x) for x in words if x.isdecimal())
+            if copies > most:
+                raise error(
+                    f"{path.name}: <{element.tag}> makes {copies:.3g} copies or points, at "
+                    f"most {most} are read; remove it, or ask for fewer"
+                )
+        todo += [(child, copies) for child in element]
         for beside in {folder, path.parent} if element.tag in INCLUDING else ():
-            included = (beside / get("file", "")).resolve()
+            included = (beside / element.get("file", "")).resolve()
             if included not in seen:
                 check_mjcf(included, folder, error, {*seen, included})
 

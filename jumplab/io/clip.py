@@ -21,6 +21,7 @@ from jumplab.io.motion import Motion, steady
 from jumplab.io.tensors import read_tensors
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet
 from jumplab.robot.files import SHIPPED, read_toml
 
 ENDINGS = (".pkl", ".npz", ".csv", ".motion")
@@ -44,11 +45,10 @@ ARRAYS = {
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
     ("_codecs", "encode"),
-    *(
-        (f"numpy.{core}.multiarray", x)
-        for core in ("core", "_core")
-        for x in ("_reconstruct", "scalar")
-    ),
+    ("numpy.core.multiarray", "_reconstruct"),
+    ("numpy.core.multiarray", "scalar"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
 }
 
 
@@ -88,16 +88,17 @@ class Clip(Shown):
         robot = getattr(record, "robot", None) or robot
         if robot is None:
             raise InputError("the robot of this motion is unknown; pass it as robot=")
-        motion = Motion.of(getattr(record, "tape", record)).every(fps or RECORD_FPS)
-        clip = cls(motion.source, robot, motion.q, fps or RECORD_FPS, "a motion of this package")
-        task = getattr(record, "task", None)
-        return replace(clip, platform_m=task.platform_m) if task else clip
+        rate = fps or RECORD_FPS
+        motion = Motion.of(getattr(record, "tape", record)).every(rate)
+        platform_m = getattr(getattr(record, "task", None), "platform_m", 0.0)
+        origin = "a motion of this package"
+        return cls(motion.source, robot, motion.q, rate, origin, platform_m=platform_m)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Raw:
     """Content of a clip's file: base (n, 3) [m], its quaternions (n, 4) x y z w, joints (n, k)
-    [rad].
+    [rad]; raises ValueError if these are no arrays of numbers.
     """
 
     base: np.ndarray
@@ -107,6 +108,13 @@ class _Raw:
     fps: float | None = None
     names: tuple[str, ...] | None = None
     usual_fps: float = USUAL_FPS  # where nobody says
+
+    def __post_init__(self) -> None:
+        for name in ("base", "turn", "joints"):
+            array = np.asarray(getattr(self, name))
+            if array.dtype.kind not in "fiu":
+                raise ValueError(f"{name}: no real numbers")
+            setattr(self, name, array)
 
 
 # files
@@ -158,16 +166,16 @@ def _content(path: Path) -> Mapping[str, Any]:
 
 def _columns(text: str) -> Mapping[str, Any]:
     """A table with commas: of names in its first line, else of x y z, quaternion and joints."""
-    first = text.lstrip().splitlines()[0].split(",")
+    head, _, rows = text.lstrip().partition("\n")
+    names = head.rstrip().split(",")
     try:
-        float(first[0])
+        float(names[0])
         return {"rows": np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2)}
     except ValueError:
-        rows = text.lstrip().partition("\n")[2]
         if not rows.strip():
             raise ValueError("no rows") from None
         table = np.loadtxt(io.StringIO(rows), delimiter=",", ndmin=2)
-        return dict(zip(first, table.T, strict=True))
+        return dict(zip(names, table.T, strict=True))
 
 
 def _rate(x: Mapping[str, Any]) -> float | None:
@@ -187,16 +195,23 @@ def _first_wxyz(x: np.ndarray) -> np.ndarray:
 
 def _of_tracker(x: Mapping[str, Any]) -> _Raw:
     joints = x["joint_pos"]
-    world = not x["body_pos_w"][:, 0].any()
-    place, turn = (x[name][:, int(world)] for name in ("body_pos_w", "body_quat_w"))
-    words = "arrays of a motion tracker, quaternion w x y z"
-    root = joints.shape[1] - len(x["joint_names"]) if "joint_names" in x else 0
-    return _Raw(place, _first_wxyz(turn), joints[:, root:], words)
+    root = int(not x["body_pos_w"][:, 0].any())  # the world may be the first body
+    before = joints.shape[1] - len(x["joint_names"]) if "joint_names" in x else 0
+    return _Raw(
+        x["body_pos_w"][:, root],
+        _first_wxyz(x["body_quat_w"][:, root]),
+        joints[:, before:],
+        "arrays of a motion tracker, quaternion w x y z",
+    )
 
 
 def _of_states(x: Mapping[str, Any]) -> _Raw:
-    place, turn = (x[f"rigid_body_{name}"][:, 0] for name in ("pos", "rot"))
-    return _Raw(place, turn, x["dof_pos"], "states of all bodies, quaternion x y z w")
+    return _Raw(
+        x["rigid_body_pos"][:, 0],
+        x["rigid_body_rot"][:, 0],
+        x["dof_pos"],
+        "states of all bodies, quaternion x y z w",
+    )
 
 
 def _of_table(x: Mapping[str, Any]) -> _Raw:
@@ -211,13 +226,13 @@ def _of_animation(x: Mapping[str, Any]) -> _Raw:
         np.column_stack([x[f"root_{word}{axis}"] for axis in "XYZ"])
         for word in ("translate", "rotate")
     )
-    joints = [name for name in x if name.endswith("_dof")]
+    joints = {name.removesuffix("_dof"): x[name] for name in x if name.endswith("_dof")}
     return _Raw(
         place / 100,
         Rotation.from_euler("xyz", turn, degrees=True).as_quat(),
-        np.radians(np.column_stack([x[name] for name in joints])),
+        np.radians(np.column_stack([*joints.values()])),
         "an animator's table, cm and degrees",
-        names=tuple(name.removesuffix("_dof") for name in joints),
+        names=tuple(joints),
         usual_fps=120.0,
     )
 
@@ -294,8 +309,8 @@ def read_clips(
         try:
             reader = FORMS[form]
             raw = _of_arrays(reader, x, form) if isinstance(reader, str) else reader(x)
-            names = raw.names or tuple(map(str, x.get("joint_names", ()))) or None
-            raw = replace(raw, fps=_rate(x), names=names, **_numbers(raw))
+            raw.names = raw.names or tuple(map(str, x.get("joint_names", ()))) or None
+            raw.fps = _rate(x)
         except (KeyError, IndexError, TypeError, ValueError) as e:
             raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
         clips.append(_clip(where, name, raw, robot, fps, order))
@@ -332,26 +347,17 @@ def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, ord
         tilt = _check_order(where, raw, robot, q, order)
         if tilt > LYING_RAD:
             notes.append(f"with them the lower sole is {tilt:.1f} rad off level half of the time")
-    q = np.hstack([q[:, :3], steady(q[:, 3:7]), q[:, 7:]])
+    q[:, 3:7] = steady(q[:, 3:7])
     _check_joints(where, robot, q)
     return Clip(name, robot, q, rate, raw.origin, tuple(notes))
-
-
-def _numbers(raw: _Raw) -> dict[str, np.ndarray]:
-    """Base, quaternions and joints as arrays; raises ValueError if they are none."""
-    out = {name: np.asarray(getattr(raw, name)) for name in ("base", "turn", "joints")}
-    for name, array in out.items():
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: no real numbers")
-    return out
 
 
 def _faults(raw: _Raw) -> Iterator[str]:
     """Sentences on what makes arrays no motion in metres and radians, z up."""
     n = len(raw.base)
-    shapes = raw.base.shape == (n, 3) and raw.turn.shape == (n, 4)
-    if not shapes or raw.joints.ndim != 2 or len(raw.joints) != n:
-        sizes = f"{raw.base.shape}, {raw.turn.shape}, {raw.joints.shape}"
+    shapes = raw.base.shape, raw.turn.shape, raw.joints.shape
+    if shapes != ((n, 3), (n, 4), (n, *raw.joints.shape[-1:])):
+        sizes = ", ".join(map(str, shapes))
         yield (
             f"base, quaternions and joints have shapes {sizes}; they must be (n, 3), (n, 4), "
             f"(n, joints)"
@@ -374,19 +380,21 @@ def _faults(raw: _Raw) -> Iterator[str]:
     away = np.abs(raw.base)
     if np.median(away.max(axis=1)) > 50:
         yield f"the base is {away.max():.0f} m away; it looks like cm or mm: pass metres"
-
-    def upright(turn: np.ndarray, axis: int = 2) -> float:
-        return float(np.median(Rotation.from_quat(turn).as_matrix()[:, axis, 2]))
-
-    if upright(raw.turn) > 0.5:
+    _, y, z = _upwards(raw.turn)
+    if z > 0.5:
         return
-    if upright(raw.turn, 1) > 0.9 and np.median(raw.base[:, 1]) > np.median(raw.base[:, 2]):
+    if y > 0.9 and np.median(raw.base[:, 1]) > np.median(raw.base[:, 2]):
         yield "the robot's up is the world's y; turn the clip so that z points up"
-    if upright(_first_wxyz(raw.turn)) > 0.9:
+    if _upwards(_first_wxyz(raw.turn))[2] > 0.9:
         yield (
             "its quaternions, read as x y z w, lay the robot down or stand it on its head; read as "
             "w x y z they keep it upright: reorder them to x y z w"
         )
+
+
+def _upwards(turn: np.ndarray) -> np.ndarray:
+    """The base's z axis in the world (3,), the median of attitudes (n, 4)."""
+    return np.median(Rotation.from_quat(turn).as_matrix()[..., 2], axis=0)
 
 
 def _fitted(where: str, raw: _Raw, robot: Robot, order: str) -> tuple[Robot, np.ndarray]:
@@ -432,9 +440,9 @@ def _siblings(robot: Robot) -> Iterator[Robot]:
     yield robot
     if robot.name not in SHIPPED:
         return
-    texts = {name: read_toml(path.read_text(), name) for name, path in SHIPPED.items()}
-    for name, config in texts.items():
-        if name != robot.name and config["urdf"] == texts[robot.name]["urdf"]:
+    urdfs = {name: read_toml(path.read_text(), name)["urdf"] for name, path in SHIPPED.items()}
+    for name, urdf in urdfs.items():
+        if name != robot.name and urdf == urdfs[robot.name]:
             yield Robot.load(name)
 
 
@@ -459,11 +467,11 @@ def _check_order(where: str, raw: _Raw, robot: Robot, q: np.ndarray, order: str)
 def _tilt(robot: Robot, q: np.ndarray) -> float:
     """Median angle of the lower sole to the ground [rad], in configurations (n, nq)."""
     data = robot.model.createData()
-    frames = [robot.model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames]
+    soles = on_feet(robot, robot.foot.center)
     upright = []
     for row in q[:: max(1, len(q) // LOOKED_AT)]:
-        pin.framesForwardKinematics(robot.model, data, row)
-        lower = min((data.oMf[k] for k in frames), key=lambda x: x.act(robot.foot.center)[2])
+        pin.forwardKinematics(robot.model, data, row)
+        lower = min((sole.place(data) for sole in soles), key=lambda place: place.translation[2])
         upright.append(lower.rotation[2, 2])
     return float(np.arccos(min(1.0, np.median(upright))))
 
@@ -471,8 +479,7 @@ def _tilt(robot: Robot, q: np.ndarray) -> float:
 def _check_joints(where: str, robot: Robot, q: np.ndarray) -> None:
     """Refuse joints that are out of their ranges most of the time: another order, or robot."""
     limits = robot.limits
-    beyond = np.maximum(limits.lower - q[:, 7:], q[:, 7:] - limits.upper)
-    excess = np.median(beyond, axis=0)
+    excess = np.median(np.maximum(limits.lower - q[:, 7:], q[:, 7:] - limits.upper), axis=0)
     worst = int(excess.argmax())
     if excess[worst] > BEYOND_RAD:
         raise InputError(

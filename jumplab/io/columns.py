@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jumplab.errors import InputError, Shown, quoted
+from jumplab.io.motion import Motion, Record
 from jumplab.robot import Robot
-
-if TYPE_CHECKING:
-    from jumplab.io.motion import Record
 
 SIDES = "left", "right"
 # short names of a robot's roles
@@ -39,19 +37,18 @@ class Rows(Shown, tuple):
     __repr__ = tuple.__repr__
 
 
-def table_of(record: Record, joints: Sequence[str], com: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns (N,) of a record by name: position, velocity and torque of every joint, in the
-    record's order of ``joints``, then the base's place and quaternion, the ``com`` (N, 3) [m], and,
+def table_of(motion: Motion, joints: Sequence[str], com: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns (N,) of a motion by name: position, velocity and torque of every joint, in the
+    motion's order of ``joints``, then the base's place and quaternion, the ``com`` (N, 3) [m], and,
     where they are known, the forces on the feet [N].
     """
     table = {}
     for kind, (name, first) in OF_JOINTS.items():
-        columns = getattr(record, name)[:, first:].T
+        columns = getattr(motion, name)[:, first:].T
         table |= {f"{joint}_{kind}": x for joint, x in zip(joints, columns, strict=True)}
-    table |= dict(zip((*BASE, *COM), (*record.q[:, :7].T, *com.T), strict=True))
-    wrench = getattr(record, "wrench", getattr(record, "foot_wrench", getattr(record, "f", None)))
-    if wrench is not None:
-        table |= dict(zip(FORCES, wrench[..., :3].reshape(-1, 6).T, strict=True))
+    table |= dict(zip((*BASE, *COM), (*motion.q[:, :7].T, *com.T), strict=True))
+    if motion.wrench is not None:
+        table |= dict(zip(FORCES, motion.wrench[..., :3].reshape(-1, 6).T, strict=True))
     return table
 
 
@@ -64,11 +61,8 @@ class Columns(Mapping[str, np.ndarray]):
         self._values = values
         self.unit = unit
         self._joints = {name: k for k, name in enumerate(robot.joint_names)}
-        self._pairs = {
-            role: [self._joints[name] for name in pair]
-            for role, pair in robot.joints.items()
-            if pair
-        }
+        pairs = {role: [self._joints[name] for name in pair] for role, pair in robot.joints.items()}
+        self._pairs = {role: pair for role, pair in pairs.items() if pair}
         short = {name: self._pairs[role] for name, role in ROLES.items() if role in self._pairs}
         roles = self._pairs | short
         sides = {
@@ -138,6 +132,6 @@ class Named:
             import pandas
         except ImportError:
             raise InputError("a frame needs pandas: pip install 'jumplab[pandas]'") from None
-        x = self._record
+        x = Motion.of(self._record)
         table = {"phase": x.phase} | table_of(x, list(self.angle), self.com)
         return pandas.DataFrame(table, index=pandas.Index(x.t, name="time_s"))

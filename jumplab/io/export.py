@@ -7,7 +7,6 @@ import logging
 import pickle
 from collections.abc import Callable, Mapping
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from jumplab.robot import Robot
 
 HELD_RAD = 0.02  # by which joints that a format leaves out may move
 LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
-PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
+PHASES = ("launch", "flight", "landing")
 
 
 def default_name(format_name: str, source: str) -> str:
@@ -69,8 +68,8 @@ def write(
         if format_name in WITH_OBJECT:
             _write_mesh(path.with_name(path.stem + MESH), whole.block(frames))
         return write_file(path, _encoded(ending, content))
-    known = (*content, ".staging", ".commit")  # the last two are left by a writer that was killed
-    strangers = [p.name for p in path.iterdir() if p.name not in known] if path.is_dir() else []
+    # the last two are left by a writer that was killed
+    strangers = {p.name for p in path.glob("*")} - {*content, ".staging", ".commit"}
     if strangers:
         raise InputError(
             f"the folder {str(path)!r} already holds {min(strangers)!r}; choose a new or an empty "
@@ -114,15 +113,15 @@ def joint_table(whole: Whole, x: Motion, fps: float) -> str:
     One header line with units, one line per frame; take-off, which a tape holds twice, stands once.
     """
     left, right = x.contact.T
-    head = {
+    table = {
         "time_s": x.t,
-        "phase_0_launch_1_flight_2_landing": [PHASE_CODES[str(phase)] for phase in x.phase],
+        "phase_0_launch_1_flight_2_landing": [PHASES.index(phase) for phase in x.phase],
         "contact_left": left,
         "contact_right": right,
+        **table_of(x, whole.joints, whole.com(x.q)),
     }
-    rest = table_of(x, whole.joints, whole.com(x.q))
-    digits = ["%.6f", *["%d"] * 3, *["%.9g"] * len(rest)]
-    return _rows(np.column_stack([*head.values(), *rest.values()]), ",".join(head | rest), digits)
+    digits = ["%.6f", *["%d"] * 3, *["%.9g"] * (len(table) - 4)]
+    return _rows(np.column_stack([*table.values()]), ",".join(table), digits)
 
 
 def bare_states(whole: Whole, x: Motion, fps: float) -> str:
@@ -170,9 +169,12 @@ def tracked(
     """
     joints, links = ordered(whole.urdf, order)
     columns = [whole.joints.index(name) for name in joints]
-    values = {"joint_pos": x.q[:, 7:], "joint_vel": x.v[:, 6:], "joint_torque": x.tau}
-    arrays = {name: table[:, columns] for name, table in values.items()}
-    arrays |= whole.bodies(x, links, at_com=at_com)
+    arrays = {
+        "joint_pos": x.q[:, 7:][:, columns],
+        "joint_vel": x.v[:, 6:][:, columns],
+        "joint_torque": x.tau[:, columns],
+        **whole.bodies(x, links, at_com=at_com),
+    }
     # whole numbers as their readers divide by them
     rate = np.array([int(fps) if fps == int(fps) else fps])
     return {
@@ -242,7 +244,8 @@ def states(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     """
     arrays = tracked(whole, x, fps)
     touching = np.zeros(arrays["body_pos_w"].shape[:2], bool)
-    touching[:, [1 + whole.joints.index(joint) for joint, _ in whole.feet]] = x.contact
+    feet = [whole.model.names[foot.joint] for foot in whole.feet(np.zeros(3))]
+    touching[:, [1 + whole.joints.index(joint) for joint in feet]] = x.contact
     return {
         "fps": arrays["fps"].item(),
         "dof_pos": arrays["joint_pos"],
@@ -308,22 +311,22 @@ def animated(whole: Whole, x: Motion, fps: float) -> str:
     """
     angles = Rotation.from_quat(x.q[:, 3:7]).as_euler("xyz", degrees=True)
     angles = np.unwrap(angles, axis=0, period=360.0)
-    head = [f"root_{word}{axis}" for word in ("translate", "rotate") for axis in "XYZ"]
-    head = ["Frame", *head, *(f"{name}_dof" for name in whole.joints)]
-    rest = np.hstack([100 * x.q[:, :3], angles, np.degrees(x.q[:, 7:])])
-    table = np.column_stack([np.arange(len(rest)), rest])
-    return _rows(table, ",".join(head), ["%d"] + ["%.9g"] * rest.shape[1])
+    root = [f"root_{word}{axis}" for word in ("translate", "rotate") for axis in "XYZ"]
+    head = ["Frame", *root, *(f"{name}_dof" for name in whole.joints)]
+    frames = np.arange(len(x.t))
+    table = np.column_stack([frames, 100 * x.q[:, :3], angles, np.degrees(x.q[:, 7:])])
+    return _rows(table, ",".join(head), ["%d"] + ["%.9g"] * (len(head) - 1))
 
 
 def pybullet_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     """The URDF, the trajectory, and a script of ten lines that shows it."""
-    script = (resources.files("jumplab.io") / "replay.py.txt").read_text(encoding="utf-8")
-    words = {"script": script.strip(), "source": x.source, "robot": whole.robot.name}
+    script = filled("io/replay.py.txt")
+    about = filled("io/replay.md", script=script.strip(), source=x.source, robot=whole.robot.name)
     return {
         "robot.urdf": whole.urdf,
         "trajectory.npz": {"hz": np.array(fps), **plain_arrays(whole, x, fps)},
         "replay.py": script,
-        "README.md": filled("io/replay.md", **words),
+        "README.md": about,
     }
 
 
@@ -331,11 +334,9 @@ def _qpos_qvel(x: Motion) -> tuple[np.ndarray, np.ndarray]:
     """MuJoCo's states: (F, 7 + J) x y z, quaternion w x y z, joints; (F, 6 + J) velocity in world
     axes, angular velocity in the root's own, joints.
     """
-    qpos = x.q.copy()
-    qpos[:, 3:7] = np.roll(x.q[:, 3:7], 1, axis=1)
-    qvel = x.v.copy()
-    qvel[:, :3] = Rotation.from_quat(x.q[:, 3:7]).apply(x.v[:, :3])
-    return qpos, qvel
+    place, turn, joints = np.split(x.q, [3, 7], axis=1)
+    speed = Rotation.from_quat(turn).apply(x.v[:, :3])
+    return np.hstack([place, np.roll(turn, 1, axis=1), joints]), np.hstack([speed, x.v[:, 3:]])
 
 
 def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
@@ -387,8 +388,11 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
         "phase": x.phase,
         "fps": np.array(fps),
     }
-    script = (resources.files("jumplab.io") / "play.py.txt").read_text(encoding="utf-8")
-    return {"robot.xml": spec.to_xml(), "motion.npz": arrays, "play.py": script}
+    return {
+        "robot.xml": spec.to_xml(),
+        "motion.npz": arrays,
+        "play.py": filled("io/play.py.txt"),
+    }
 
 
 CONTENTS: Mapping[str, Callable[[Whole, Motion, float], Any]] = {

@@ -16,13 +16,12 @@ import tempfile
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, Generic, TypeVar
+from typing import Any, BinaryIO
 
 from jumplab import reading
 from jumplab.errors import InputError, as_path
 
-K = TypeVar("K", bound=Hashable)
-V = TypeVar("V")
+Parse = Callable[[Any], tuple[Hashable, Any]]  # key and value of a line's data
 LOCK_WAIT_S = 20.0  # a write lasts well under a second: after a longer wait something hangs
 LOCK_LOOK_S = 0.005  # between two looks whether a lock is free
 AT_SETTLE: list[Callable[[], None]] = []  # functions to call, see settle
@@ -137,14 +136,14 @@ def _try_lock(fd: int, kind: int) -> bool:
 
 
 # log ------------------------------------------------------------------------------------------
-class Log(Generic[K, V]):
+class Log:
     """An open log; made by :func:`open_log`.
 
     ``done`` is what its lines say, the last one of equal keys; damaged and foreign lines are left
     out. ``empty`` is True if it had no line at all.
     """
 
-    def __init__(self, file: BinaryIO, parse: Callable[[Any], tuple[K, V]]):
+    def __init__(self, file: BinaryIO, parse: Parse):
         file.seek(0)
         self._file = file
         self.done = {}
@@ -174,9 +173,7 @@ class Log(Generic[K, V]):
 
 
 @contextlib.contextmanager
-def open_log(
-    path: str | Path, command: str, parse: Callable[[Any], tuple[K, V]]
-) -> Iterator[Log[K, V]]:
+def open_log(path: str | Path, command: str, parse: Parse) -> Iterator[Log]:
     """The log at ``path``, for one process at a time; it is made if it is missing, and goes if
     nothing is added.
 

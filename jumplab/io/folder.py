@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -37,19 +37,18 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.task import GRAVITY
 
-T = TypeVar("T")
 Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
 # whose versions a result names; by the last three notebooks draw and pose their own programs
-PACKAGES = ("jumplab", "casadi", "pin", "proxsuite", "coal", "pybullet", "mujoco", "numpy", "scipy")
-PACKAGES += ("matplotlib", "cvxpy", "clarabel")
+PACKAGES = """jumplab casadi pin proxsuite coal pybullet mujoco numpy scipy matplotlib cvxpy
+    clarabel""".split()
 # the same sources, built for later Pythons under another name
-BUILDS = {"pybullet": "pybullet-arm64"}
+BUILDS = {"pybullet-arm64": "pybullet"}
 PLAN = "plan.npz"
 URDF = "robot.urdf"
 CONFIG = "robot.toml"
 SUMMARY = "summary.json"
-HASHED = (PLAN, URDF, CONFIG)
+HASHED = {PLAN: "arrays", URDF: "robot", CONFIG: "robot"}  # and their kinds
 # of exports: name of the format -> file or folder, frames a second that its usual readers expect
 FORMATS = {
     "csv": ("joints.csv", 1000.0),
@@ -75,10 +74,21 @@ MESHES = tuple(FORMATS[name][0].removesuffix(".npz") + MESH for name in WITH_OBJ
 EXPORTS = (*(file for file, _ in FORMATS.values()), *MESHES)
 # what a new simulation makes untrue and therefore removes, and what a new plan does
 OF_SIMULATION = ("jump.html", *(f"simulated_{name}" for name in EXPORTS))
-TRIALS = ("trials.jsonl", "trials.json", "basin.json", "margins.json")
-RESULTS = ("passport.json", "simulation.npz", "simulation.json", *TRIALS)
 CERTIFICATE = ("certificate.json", "certificate.html")
-OF_PLAN = (SUMMARY, "plan.html", *RESULTS, *CERTIFICATE, *EXPORTS, *OF_SIMULATION)
+OF_PLAN = (
+    SUMMARY,
+    "plan.html",
+    "passport.json",
+    "simulation.npz",
+    "simulation.json",
+    "trials.jsonl",
+    "trials.json",
+    "basin.json",
+    "margins.json",
+    *CERTIFICATE,
+    *EXPORTS,
+    *OF_SIMULATION,
+)
 _STAGING = ".staging"
 _COMMIT = ".commit"
 
@@ -139,27 +149,28 @@ def _remove(path: Path) -> None:
 @cache  # a sweep audits thousands of plans
 def versions() -> dict[str, str]:
     """Version of Python and of every package that shapes a result."""
-    numbers = {"python": platform.python_version()}
-    for name in PACKAGES:
-        for build in (name, BUILDS.get(name, name)):
-            with contextlib.suppress(metadata.PackageNotFoundError):
-                numbers.setdefault(name, metadata.version(build))
-        numbers.setdefault(name, "not installed")
+    numbers = {"python": platform.python_version(), **dict.fromkeys(PACKAGES, "not installed")}
+    for build in (*BUILDS, *PACKAGES):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            numbers[BUILDS.get(build, build)] = metadata.version(build)
     return numbers
 
 
 def to_json(data: Any) -> str:
-    """JSON of nested mappings, sequences, NumPy values, paths; null for what is not finite."""
-    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    """JSON of :func:`plain` data."""
+    return json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _plain(x: Any) -> Any:
+def plain(x: Any) -> Any:
+    """Plain data for JSON of nested mappings, sequences, NumPy values, paths; None for what is not
+    finite.
+    """
     if isinstance(x, Mapping):
-        return {str(k): _plain(v) for k, v in x.items()}
+        return {str(k): plain(v) for k, v in x.items()}
     if isinstance(x, np.ndarray | np.generic):
-        return _plain(x.tolist())
+        return plain(x.tolist())
     if isinstance(x, list | tuple):
-        return [_plain(v) for v in x]
+        return [plain(v) for v in x]
     if isinstance(x, float):
         return x if math.isfinite(x) else None
     return str(x) if isinstance(x, Path) else x
@@ -176,8 +187,8 @@ def write_plan(
     tape: Tape,
     robot: Robot,
     summary: Summary,
-    complete: Callable[[Path], T] | None = None,
-) -> T | None:
+    complete: Callable[[Path], Any] | None = None,
+) -> Any:
     """Write a plan's folder; what an older plan left there, with its passport and simulation, goes.
 
     ``summary`` becomes ``summary.json``, with a ``manifest`` added: versions, robot, hashes of the
@@ -294,7 +305,7 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
             summary = _read_summary(folder)
             files = {
                 name: reading.content(folder / name, kind, link=False)
-                for name, kind in zip(HASHED, ("arrays", "robot", "robot"), strict=True)
+                for name, kind in HASHED.items()
             }
             for name, raw in files.items():
                 if hashlib.sha256(raw).hexdigest() != summary["manifest"]["files"][name]:

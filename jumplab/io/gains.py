@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from jumplab.io.motion import Motion
@@ -49,35 +50,33 @@ class Dynamics:
         self.data = self.model.createData()
         motors = [robot.actuators.get(name, {}) for name in self.model.names[2:]]
         self.model.armature[6:] = [motor.get("armature", 0.0) for motor in motors]
-        self._damping = np.array([motor.get("damping", 0.0) for motor in motors])
-        tip = pin.SE3(np.eye(3), robot.foot.tip)
-        self._tips = [(self.model.getJointId(name), place * tip) for name, place in whole.feet]
+        self._damping = np.array([0.0] * 6 + [motor.get("damping", 0.0) for motor in motors])
+        self._tips = whole.feet(robot.foot.tip)
 
     def held(self, q: np.ndarray, carries: np.ndarray) -> Held:
         """Joint, place and rows that the ground holds, of each foot that ``carries`` (2,) names."""
         pin.forwardKinematics(self.model, self.data, q)
         out = []
-        for (joint, place), down in zip(self._tips, carries, strict=True):
-            tipped = -(self.data.oMi[joint] * place).rotation[2, 0]  # toes down
+        for tip, down in zip(self._tips, carries, strict=True):
+            tipped = -tip.place(self.data).rotation[2, 0]  # toes down
             if down:
                 rows = [row for row in range(6) if row != PITCH or tipped < FLAT_RAD]
-                out.append((joint, place, rows))
+                out.append((tip.joint, tip.placement, rows))
         return out
 
     def jacobians(self, held: Held) -> list[np.ndarray]:
         """Rows (n, nv) of the twists of what is held, of each foot; of the last state."""
-        parts = (self.model, self.data)
-        return [pin.getFrameJacobian(*parts, *at, pin.LOCAL)[rows] for *at, rows in held]
+        return [
+            pin.getFrameJacobian(self.model, self.data, *at, pin.LOCAL)[rows] for *at, rows in held
+        ]
 
     def solved(self, jacobians: list[np.ndarray], right: np.ndarray) -> np.ndarray:
         """Accelerations, and contact forces with their sign turned (nv + rows, ...), of right-hand
         sides of that size, by ``jacobians`` (rows, nv) of each foot.
         """
-        mass = self.data.M
-        rows = np.vstack([np.zeros((0, len(mass))), *jacobians])
-        return np.linalg.solve(
-            np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]]), right
-        )
+        rows = np.vstack([np.zeros((0, self.model.nv)), *jacobians])
+        none = np.zeros((len(rows), len(rows)))
+        return np.linalg.solve(np.block([[self.data.M, rows.T], [rows, none]]), right)
 
     def accelerations(
         self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, held: Held
@@ -87,7 +86,7 @@ class Dynamics:
         data = self.data
         pin.computeAllTerms(model, data, q, v)
         pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
-        push = np.concatenate([np.zeros(6), tau - self._damping * v[6:]]) - data.nle
+        push = np.pad(tau, (6, 0)) - self._damping * v - data.nle
         jacobians = self.jacobians(held)
         due = [
             -pin.getFrameAcceleration(model, data, *at, pin.LOCAL).vector[rows] - DAMPING * j @ v
@@ -111,7 +110,7 @@ class Dynamics:
             wrench[rows], forces = np.split(forces, [len(rows)])
             pushes[joint] += place.act(pin.Force(wrench))
         pin.computeRNEADerivatives(model, data, q, v, a, pushes)
-        by_rates = data.dtau_dv + np.diag([0.0] * 6 + [*self._damping])
+        by_rates = data.dtau_dv + np.diag(self._damping)
         right = [np.hstack([-data.dtau_dq, -by_rates, np.eye(nv)[:, 6:]])]
         pin.computeForwardKinematicsDerivatives(model, data, q, v, a)
         turns = [(data.oMi[joint] * place).rotation for joint, place, _ in held]
@@ -170,13 +169,13 @@ def gains(whole: Whole, x: Motion) -> tuple[np.ndarray, np.ndarray]:
     cost = costs(whole)
     value = np.diag(cost[0])
     out = np.zeros((len(q), len(order), 2 * whole.model.nv), np.float32)
-    rows = [*range(len(q)), *[len(q) - 1] * round(HOLD_S / PERIOD_S)]
-    step = None
-    for ahead, k in zip([None, *rows[:0:-1]], rows[::-1], strict=True):
-        if k != ahead:
-            held = dynamics.held(q[k], x.contact[k])
-            step = discrete(*dynamics.derivatives(q[k], v[k], tau[k], held))
-        gain, value = riccati(*step, *cost, value)
+    lasts = np.ones(len(q), int)  # periods
+    lasts[-1] += round(HOLD_S / PERIOD_S)
+    for k in reversed(range(len(q))):
+        held = dynamics.held(q[k], x.contact[k])
+        step = discrete(*dynamics.derivatives(q[k], v[k], tau[k], held))
+        for _ in range(lasts[k]):
+            gain, value = riccati(*step, *cost, value)
         out[k] = (gain @ from_mujoco(q[k], v[k], order))[order]
     return x.t, out
 
@@ -185,10 +184,7 @@ def from_mujoco(q: np.ndarray, v: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Errors (2 nv, 2 nv) in Pinocchio's axes and order of MuJoCo's small ones."""
     nv = len(v)
     back = Rotation.from_quat(q[3:7]).as_matrix().T
-    out = np.zeros((2 * nv, 2 * nv))
-    for first in (0, nv):
-        out[first : first + 3, first : first + 3] = back
-        out[first + 3 : first + 6, first + 3 : first + 6] = np.eye(3)
-        out[first + 6 + order, first + 6 + np.arange(nv - 6)] = 1.0
+    parts = back, np.eye(3), np.eye(len(order))[:, order]
+    out = block_diag(*parts, *parts)
     out[nv : nv + 3, 3:6] = pin.skew(v[:3])  # own axes turn with the base
     return out

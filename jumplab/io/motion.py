@@ -79,8 +79,8 @@ class Motion:
             raise InputError(
                 f"{str(folder)!r} holds no simulation; run 'jumplab simulate {folder}' first"
             )
-        logs = read_simulation(folder, robot, ("t", "q", "v", "tau", "phase"), ("foot_wrench",))
-        return cls.of(SimpleNamespace(**logs))
+        names = ("t", "q", "v", "tau", "phase", "foot_wrench")
+        return cls.of(SimpleNamespace(**read_simulation(folder, robot, names)))
 
     @property
     def duration(self) -> float:
@@ -95,23 +95,20 @@ class Motion:
         An instant that stands twice gives its later sample, so that take-off belongs to the flight.
         Raises :class:`InputError` if a time lies outside the motion, or a quaternion is zero.
         """
-        if not np.all(np.any(self.q[:, 3:7], axis=1)):
+        if not self.q[:, 3:7].any(axis=1).all():
             raise InputError(
                 "a quaternion of the base is zero, which is no attitude; make the motion again"
             )
         times = np.asarray(times, float)
-        if len(times) and not (
-            self.t[0] <= times.min() and times.max() <= self.t[-1] + END_TOLERANCE
-        ):
+        if not ((times >= self.t[0]) & (times <= self.t[-1] + END_TOLERANCE)).all():
             asked = f"{times.min():g} ... {times.max():g} s"
             raise InputError(
                 f"times {asked} are outside the motion, {self.t[0]:g} ... {self.t[-1]:g} s"
             )
         row = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
-        gap = self.t[row + 1] - self.t[row]
-        share = np.ones(len(times))  # where the last instant stands twice
-        np.divide(times - self.t[row], gap, out=share, where=gap > 0)
-        share = np.clip(share, 0.0, 1.0)
+        # no gap is where the last instant stands twice, of which the later sample counts
+        gap = np.maximum(self.t[row + 1] - self.t[row], END_TOLERANCE)
+        share = 1.0 - np.clip((self.t[row + 1] - times) / gap, 0.0, 1.0)
 
         def between(x: np.ndarray) -> np.ndarray:
             return x[row] + share.reshape(-1, *[1] * (x.ndim - 1)) * (x[row + 1] - x[row])
@@ -133,7 +130,7 @@ class Motion:
         With ``end`` its last instant follows, where it is none of the grid: touchdown, in a plan.
         """
         checked_rate(rate_hz)
-        count = int(np.floor((self.duration + END_TOLERANCE) * rate_hz)) + 1
+        count = int((self.duration + END_TOLERANCE) * rate_hz) + 1
         times = np.minimum(self.t[0] + np.arange(count) / rate_hz, self.t[-1])
         more = end and self.t[-1] - times[-1] > END_TOLERANCE
         return self.at(np.append(times, self.t[-1:] if more else []))
@@ -150,17 +147,16 @@ def checked_rate(rate_hz: float) -> float:
 
 
 def read_simulation(
-    folder: str | Path, robot: Robot, names: Sequence[str], more: Sequence[str] = ()
+    folder: str | Path, robot: Robot, names: Sequence[str]
 ) -> dict[str, np.ndarray]:
-    """Arrays ``names`` (t, q, v, tau, phase among them) of the ``simulation.npz`` in ``folder``,
-    and ``more`` if there.
+    """Arrays ``names`` (t, q, v, tau, phase among them) of the ``simulation.npz`` in ``folder``.
 
     Raises :class:`InputError` if the file is damaged or not one of ``robot``.
     """
     path = Path(folder) / SIMULATION_NAME
     try:
         file = reading.arrays(reading.content(path, "arrays", link=False))
-        data = {k: file[k] for k in (*names, *(k for k in more if k in file))}
+        data = {k: file[k] for k in names}
         schema = str(file["schema"])
         joints = tuple(str(n) for n in file["joint_names"])
     except reading.DAMAGE as e:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -102,10 +102,9 @@ class Tape(Shown):
 
     def until(self, row: int) -> Tape:
         """The tape up to a ``row`` (of N), which it does not have any more."""
-        rows = self.arrays().items()
-        cut = {k: x[:row] for k, x in rows if np.shape(x)[:1] == self.t.shape}
-        fields = {k: x for k, x in cut.items() if k in _DIMENSIONS}
-        return replace(self, **fields, extra={k: cut.get(k, x) for k, x in self.extra.items()})
+        arrays = self.arrays().items()
+        long = {k: x[:row] for k, x in arrays if np.shape(x)[:1] == self.t.shape}
+        return self._of(self.arrays() | long)
 
     @property
     def takeoff_index(self) -> int:
@@ -151,7 +150,7 @@ class Tape(Shown):
             data = reading.arrays(raw)
         except reading.DAMAGE as e:
             raise cls._unreadable(path, e) from e
-        schema = str(data.pop("schema", "none"))
+        schema = str(data.get("schema", "none"))
         if schema != SCHEMA:
             raise InputError(
                 f"{path}: schema {schema!r}, this version reads {SCHEMA!r}; plan the jump again"
@@ -159,5 +158,11 @@ class Tape(Shown):
         for name in _DIMENSIONS:
             if name not in data:
                 raise InputError(f"{path}: the array {name!r} is missing; plan the jump again")
-        fields = {name: data.pop(name) for name in _DIMENSIONS}
-        return cls(**fields, extra=data)
+        return cls._of(data)
+
+    @classmethod
+    def _of(cls, arrays: dict[str, np.ndarray]) -> Tape:
+        """The tape of all :meth:`arrays`."""
+        fields = {name: arrays.pop(name) for name in _DIMENSIONS}
+        del arrays["schema"]
+        return cls(**fields, extra=arrays)

@@ -98,15 +98,15 @@ class _Reader(pickle.Unpickler):
 
 
 def _rebuilt(numbers: np.ndarray, first: int, shape: tuple, strides: tuple, *rest: Any) -> Any:
-    wanted = np.empty(0)
-    if math.prod(shape):
-        last = first + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
-        fits = last < len(numbers) and math.prod(shape) <= len(numbers)  # no copies of one number
-        if min(first, *shape, *strides, last, 0) < 0 or not fits:
-            raise ValueError(f"a tensor of shape {shape} does not fit its numbers")
-        steps = [numbers.itemsize * step for step in strides]
-        wanted = np.lib.stride_tricks.as_strided(numbers[first:], shape, steps)
-    return wanted.reshape(shape).copy()
+    count = math.prod(shape)
+    if count == 0:
+        return np.empty(shape, numbers.dtype)
+    # no copies of one number, and no steps for whose sums NumPy's own check is too narrow
+    if max([count, *map(abs, strides)]) > len(numbers):
+        raise ValueError(f"a tensor of shape {shape} does not fit its numbers")
+    size = numbers.itemsize
+    steps = [size * step for step in strides]
+    return np.ndarray(shape, numbers.dtype, numbers, size * first, steps).copy()
 
 
 def read_tensors(raw: bytes) -> Any | None:

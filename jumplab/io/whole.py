@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, RobotError
+from jumplab.errors import InputError
 from jumplab.io.motion import Motion, steady
 from jumplab.robot import Robot
+from jumplab.robot.contact import WORLD, Anchor, on_feet
 from jumplab.robot.files import entry, numbers, read_toml
 
 ORDERS = ("depth-first", "breadth-first")  # of links and joints: MuJoCo's and Isaac Lab's
@@ -45,17 +47,18 @@ class Whole:
             self.joints, self.links = ordered(self.urdf)
             self.model = pin.buildModelFromXML(self.urdf, pin.JointModelFreeFlyer())
         except (ValueError, AttributeError, KeyError, ElementTree.ParseError) as e:
-            raise RobotError(
-                f"robot {robot.name}: [published] holds no URDF: {str(e).splitlines()[0]}"
-            ) from e
+            raise robot.error(f"[published] holds no URDF: {str(e).splitlines()[0]}") from e
         self.model.gravity.linear = np.array([0.0, 0.0, -robot.gravity])
+        self._data = self.model.createData()
         self._held = numbers(config, "published", "held")
-        trunk = entry(config, "published", "trunk", kind=str, default=self.links[0])
-        self._trunk = self._frame(trunk)
+        self._trunk = self._frame(
+            entry(config, "published", "trunk", kind=str, default=self.links[0])
+        )
         for name in (*robot.joint_names, *self._held):
             if name not in self.joints:
-                raise RobotError(f"robot {robot.name}: [published] lacks the joint {name!r}")
+                raise robot.error(f"[published] lacks the joint {name!r}")
         self.order = self._columns(self.joints)
+        self._back = np.argsort(self.order)
         self._jumping = self._columns(robot.joint_names)
 
     def _columns(self, names: Iterable[str]) -> np.ndarray:
@@ -65,26 +68,23 @@ class Whole:
 
     def _frame(self, link: str) -> int:
         if not self.model.existFrame(link, pin.FrameType.BODY):
-            raise RobotError(f"robot {self.robot.name}: [published] lacks the link {link!r}")
+            raise self.robot.error(f"[published] lacks the link {link!r}")
         return self.model.getFrameId(link, pin.FrameType.BODY)
 
-    @property
-    def feet(self) -> list[tuple[str, pin.SE3]]:
-        """Of each foot the joint that moves it, and the place of its link in that joint's axes."""
-        model = self.robot.model
-        frames = [model.frames[model.getFrameId(name, pin.BODY)] for name in self.robot.foot.frames]
-        return [(model.names[frame.parentJoint], frame.placement) for frame in frames]
+    def feet(self, point: np.ndarray) -> list[Anchor]:
+        """A ``point`` (3,) of the foot links' frames [m], of the left and of the right foot."""
+        names = self.robot.model.names
+        feet = on_feet(self.robot, point)
+        return [replace(foot, joint=self.model.getJointId(names[foot.joint])) for foot in feet]
 
     def states(self, x: Motion) -> tuple[np.ndarray, np.ndarray]:
         """Configurations (F, nq) and velocities (F, nv) of :meth:`frames` in Pinocchio's order."""
-        back = np.argsort(self.order)
-        return _sorted(x.q, back), _sorted(x.v, back)
+        return _sorted(x.q, self._back), _sorted(x.v, self._back)
 
     def com(self, q: np.ndarray) -> np.ndarray:
         """CoM (F, 3) [m] at configurations (F, nq) of :meth:`frames`."""
-        data = self.model.createData()
-        rows = _sorted(q, np.argsort(self.order))
-        return np.array([pin.centerOfMass(self.model, data, row).copy() for row in rows])
+        rows = _sorted(q, self._back)
+        return np.array([pin.centerOfMass(self.model, self._data, row).copy() for row in rows])
 
     def frames(self, motion: Motion, fps: float) -> Motion:
         """A motion at ``fps`` [1/s] and at its end, as one of the published robot from time 0 [s],
@@ -97,21 +97,20 @@ class Whole:
         """
         x = motion.every(fps, end=True)
         model = self.model
-        data = model.createData()
+        data = self._data
         q = np.tile(pin.neutral(model), (len(x.t), 1))
         v = np.zeros((len(x.t), model.nv))
         q[:, 7 + self._columns(self._held)] = [*self._held.values()]
         q[:, 7 + self._jumping] = x.q[:, 7:]
         v[:, 6 + self._jumping] = x.v[:, 6:]
-        for k, (qk, vk) in enumerate(zip(q, v, strict=True)):
+        for qk, vk, base, base_twist in zip(q, v, x.q[:, :7], x.v[:, :6], strict=True):
             # the root's state is that which gives the trunk its own
             pin.forwardKinematics(model, data, qk, vk)
             trunk = pin.updateFramePlacement(model, data, self._trunk)
-            twist = self._offset.actInv(pin.Motion(x.v[k, :6]))
+            twist = self._offset.actInv(pin.Motion(base_twist))
             twist -= pin.getFrameVelocity(model, data, self._trunk)
-            place = pin.XYZQUATToSE3(x.q[k, :7]) * self._offset * trunk.inverse()
-            q[k, :7] = pin.SE3ToXYZQUAT(place)
-            v[k, :6] = trunk.act(twist).vector
+            qk[:7] = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(base) * self._offset * trunk.inverse())
+            vk[:6] = trunk.act(twist).vector
         q[:, 3:7] = steady(q[:, 3:7])
         self._check_places(q[0], x.q[0])
         change = np.gradient(v, x.t, axis=0) if len(x.t) > 1 else np.zeros_like(v)
@@ -122,11 +121,9 @@ class Whole:
 
     def soles(self, q: np.ndarray) -> np.ndarray:
         """Corners (2, 4, 3) of the soles [m] at a configuration (nq,) of :meth:`frames`."""
-        data = self.model.createData()
-        pin.forwardKinematics(self.model, data, _sorted(q[None], np.argsort(self.order))[0])
-        places = [data.oMi[self.model.getJointId(joint)] * place for joint, place in self.feet]
-        corners = self.robot.foot.corners
-        return np.array([corners @ place.rotation.T + place.translation for place in places])
+        pin.forwardKinematics(self.model, self._data, _sorted(q[None], self._back)[0])
+        places = [foot.place(self._data) for foot in self.feet(np.zeros(3))]
+        return np.array([[place.act(x) for x in self.robot.foot.corners] for place in places])
 
     def block(self, x: Motion) -> tuple[np.ndarray, np.ndarray, float] | None:
         """Half sizes (3,) and centre (3,) [m], and heading [rad], of a box on the lower of the two
@@ -139,26 +136,24 @@ class Whole:
             return None
         heading = float(np.arctan2(way[1], way[0]))
         axes = pin.rpy.rpyToMatrix(0.0, 0.0, heading)
-        along = (ends @ axes)[..., 0]
-        rim = min(RIM_M, max(along[1].min() - along[0].max(), 0.0) / 2)
-        edges = [along[1].min() - rim, along[1].max() + BEYOND_M]
+        (begin, end), across, _ = np.moveaxis(ends @ axes, -1, 0)
+        rim = min(RIM_M, max(end.min() - begin.max(), 0.0) / 2)
+        edges = [end.min() - rim, end.max() + BEYOND_M]
         if way[2] < 0:
-            edges = [along[0].min() - BEYOND_M, along[0].max() + rim]
-        middle = np.array([np.mean(edges), (ends @ axes)[..., 1].mean(), 0.0])
+            edges = [begin.min() - BEYOND_M, begin.max() + rim]
         half = np.array([np.ptp(edges) / 2, BEYOND_M, abs(way[2]) / 2])
-        return half, axes @ middle + [0.0, 0.0, way[2] / 2], heading
+        return half, axes @ [np.mean(edges), across.mean(), way[2] / 2], heading
 
     def own(self, q: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
         """The inverse of :meth:`frames`: configurations (F, nq) of the robot that jumps, from those
         of the published one (F, 7 + J), joints depth-first; and how far joints that it holds move
         off where they are held [rad].
         """
-        data = self.model.createData()
-        state = _sorted(q, np.argsort(self.order))
+        state = _sorted(q, self._back)
         places = []
         for row in state:
-            pin.forwardKinematics(self.model, data, row)
-            trunk = pin.updateFramePlacement(self.model, data, self._trunk)
+            pin.forwardKinematics(self.model, self._data, row)
+            trunk = pin.updateFramePlacement(self.model, self._data, self._trunk)
             places.append(pin.SE3ToXYZQUAT(trunk * self._offset.inverse()))
         moved = {
             name: float(np.abs(q[:, 7 + k] - self._held.get(name, 0.0)).max())
@@ -191,17 +186,16 @@ class Whole:
         ``at_com``.
         """
         model = self.model
-        data = model.createData()
+        data = self._data
         frames = [self._frame(name) for name in links]
         levers = [model.inertias[model.frames[i].parentJoint].lever * at_com for i in frames]
-        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         rows = []
         for q, v in zip(*self.states(x), strict=True):
             pin.forwardKinematics(model, data, q, v)
             pin.updateFramePlacements(model, data)
             for frame, lever in zip(frames, levers, strict=True):
                 pose = data.oMf[frame]
-                twist = pin.getFrameVelocity(model, data, frame, axes)
+                twist = pin.getFrameVelocity(model, data, frame, WORLD)
                 speed = twist.linear + np.cross(twist.angular, pose.rotation @ lever)
                 rows.append([*pin.SE3ToXYZQUAT(pose), *speed, *twist.angular])
         table = np.reshape(rows, (len(x.t), len(links), 13))
@@ -216,20 +210,20 @@ class Whole:
 
 def _sorted(rows: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Rows (F, n) whose last columns, the joints, are in another ``order`` (J,)."""
-    joints = rows[:, -len(order) :]
-    return np.hstack([rows[:, : -len(order)], joints[:, order]])
+    base, joints = np.split(rows, [-len(order)], axis=1)
+    return np.hstack([base, joints[:, order]])
 
 
 def ordered(urdf: str, order: str = ORDERS[0]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of joints and links of a URDF in one of :data:`ORDERS`, siblings as it lists them."""
     tree = ElementTree.fromstring(urdf)
     below = {link.get("name"): [] for link in tree.iterfind("link")}
-    children = set()
+    roots = list(below)
     for joint in tree.iterfind("joint"):
         parent, child = (joint.find(end).get("link") for end in ("parent", "child"))
         below[parent].append((joint.get("name"), child, joint.get("type")))
-        children.add(child)
-    waiting = [("", next(link for link in below if link not in children), "root")]
+        roots.remove(child)
+    waiting = [("", roots[0], "root")]
     moving = []
     while waiting:
         name, link, kind = waiting.pop(0)

@@ -9,6 +9,7 @@ through here get equal scales.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -24,7 +25,7 @@ from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.sagittal import rotated
 from jumplab.robot.stance import stance_angles, stance_configuration
 from jumplab.robot_import.urdf import placed
-from jumplab.show.shapes import rounded_body
+from jumplab.show.shapes import Part, rounded_body
 from jumplab.show.style import (
     FLIGHT,
     GROUND,
@@ -72,22 +73,26 @@ class Silhouette:
         self._axes = VIEWS[view]
         self._data = robot.model.createData()
         pin.forwardKinematics(self._model, self._data, pin.neutral(self._model))
-        parts = rounded_body(robot)
-        left = [self._data.oMi[p.joint].act(p.points.mean(axis=0))[1] for p in parts]
+        self._parts = rounded_body(robot)
         if view == "side":  # far ones first
-            parts = [parts[k] for k in np.argsort(left, kind="stable")]
-        self._parts = [
-            (part, "far" if y < -1e-3 and view == "side" and part.kind != "trunk" else part.kind)
-            for part, y in zip(parts, sorted(left), strict=True)
-        ]
+            self._parts = [
+                replace(part, kind="far")
+                if self._left(part) < -1e-3 and part.kind != "trunk"
+                else part
+                for part in sorted(self._parts, key=self._left)
+            ]
+
+    def _left(self, part: Part) -> float:
+        """Place of a part along y [m]."""
+        return self._data.oMi[part.joint].act(part.points.mean(axis=0))[1]
 
     def outlines(self, q: np.ndarray) -> list[tuple[str, np.ndarray]]:
         """(kind, outline (n, 2) [m]) of every box at a configuration (nq,), far ones first."""
         pin.forwardKinematics(self._model, self._data, q)
         outlines = []
-        for part, kind in self._parts:
+        for part in self._parts:
             flat = placed(self._data.oMi[part.joint], part.points)[:, self._axes]
-            outlines.append((kind, flat[ConvexHull(flat).vertices]))
+            outlines.append((part.kind, flat[ConvexHull(flat).vertices]))
         return outlines
 
     def joints(self, q: np.ndarray) -> dict[str, np.ndarray]:
@@ -163,9 +168,8 @@ def film_strip(
 ) -> None:
     """Frames (n, nq), CoM at ``places`` (n,) [m], times (n,) [s] below the ground."""
     frames = shaped(frames, (None, body.robot.model.nq), "frames")
-    times, places = (
-        shaped(x, (len(frames),), name) for x, name in ((times, "times"), (places, "places"))
-    )
+    times = shaped(times, (len(frames),), "times")
+    places = shaped(places, (len(frames),), "places")
     strobe(ax, body, frames, colors, shifts=places - [body.com(q)[0] for q in frames])
     for place, t in zip(places, times, strict=True):
         ax.text(place, -BELOW_M, f"{t:.2f} s", ha="center", va="top", fontsize=7)
@@ -197,11 +201,13 @@ def five_link_points(
     """Places (2,) [m] of toe, heel, joints, hand and com for link angles (5,) [rad]."""
     toe = shaped(toe, (2,), "toe")
     angles = shaped(angles, (len(model.span),), "angles")
-    spans = [rotated(angle, span) for angle, span in zip(angles, model.span, strict=True)]
-    tips = toe + np.cumsum(spans, axis=0)
-    places = dict(zip(("ankle", "knee", "hip", "shoulder", "hand"), tips, strict=True))
-    com = toe + model.mass @ model.link_coms(angles) / model.total_mass
-    return places | {"toe": toe, "heel": toe + rotated(angles[0], model.heel), "com": com}
+    tips = toe + np.cumsum(list(map(rotated, angles, model.span)), axis=0)
+    return {
+        **dict(zip(("ankle", "knee", "hip", "shoulder", "hand"), tips, strict=True)),
+        "toe": toe,
+        "heel": toe + rotated(angles[0], model.heel),
+        "com": toe + model.mass @ model.link_coms(angles) / model.total_mass,
+    }
 
 
 def draw_ground(
@@ -244,9 +250,9 @@ def robot_sheet(robot: Robot) -> Figure:
     axes = fig.subplots(1, 3)
     q = stance_configuration(robot)
     side = Silhouette(robot)
-    top = max(outline[:, 1].max() for _, outline in side.outlines(q))
     com = side.com(q)
     draw_robot(axes[0], side, q, BODY)
+    top = axes[0].dataLim.y1  # of the robot
     draw_com(axes[0], com)
     axes[0].annotate("CoM", com, (8, 0), va="center", **(NOTE_STYLE | {"color": VERMILION}))
     _draw_joints(axes[1], robot, q, top)
@@ -265,13 +271,20 @@ def _draw_joints(ax: Axes, robot: Robot, q: np.ndarray, top: float) -> None:
     model = robot.model
     places = Silhouette(robot, "front").joints(q)
     roles = {name: role for role, pair in robot.joints.items() for name in pair}
-    edge = dict(markeredgecolor=INK, markeredgewidth=0.6, marker="o")
     for joint, (name, place) in enumerate(places.items(), 2):
         start = places.get(model.names[model.parents[joint]], (0.0, q[2]))
         ax.plot(*zip(start, place, strict=True), color=BODY, linewidth=2.0, zorder=2)
         face = ROLE_COLORS.get(roles.get(name), "white")
         size = 6 if name in roles else 3.5
-        ax.plot(*place, markerfacecolor=face, markersize=size, zorder=10 - size, **edge)
+        ax.plot(
+            *place,
+            marker="o",
+            markersize=size,
+            markerfacecolor=face,
+            markeredgecolor=INK,
+            markeredgewidth=0.6,
+            zorder=10 - size,
+        )
     for role, pair in robot.joints.items():
         look = dict(va="center", fontsize=7, color=ROLE_COLORS[role])
         if pair:
@@ -290,6 +303,6 @@ def _draw_links(ax: Axes, robot: Robot, top: float) -> None:
     places = (points["toe"] + [0.0, 0.03 * top], *middles, points["hand"])
     for name, (x, z), mass in zip(SAGITTAL_LINKS, places, model.mass, strict=True):
         if mass > 0:
-            look = dict(va="center", fontsize=7, color="#444444")
-            ax.text(x + 0.06 * top, z, f"{name} {mass:.1f} kg", **look)
+            words = f"{name} {mass:.1f} kg"
+            ax.text(x + 0.06 * top, z, words, va="center", fontsize=7, color="#444444")
     draw_com(ax, points["com"])

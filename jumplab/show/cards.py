@@ -107,8 +107,15 @@ def _of_robot(robot: Robot) -> Card:
     for role, pair in robot.joints.items():
         row = {"role": role.replace("_", " "), "joints": ", ".join(pair) or "held"}
         rows.append(row | (dict(robot.actuators[pair[0]]) if pair else {}))
-    columns = {"role": "role", "joints": "joints", "lower": "from [rad]", "upper": "to [rad]"}
-    return table(rows, columns | {"effort": "N m", "speed": "rad/s"}), robot_sheet(robot)
+    columns = {
+        "role": "role",
+        "joints": "joints",
+        "lower": "from [rad]",
+        "upper": "to [rad]",
+        "effort": "N m",
+        "speed": "rad/s",
+    }
+    return table(rows, columns), robot_sheet(robot)
 
 
 def _of_audit(report: AuditReport) -> Card:
@@ -140,9 +147,16 @@ def _shares(report: AuditReport) -> Figure | None:
 
 
 def _of_clip(report: ClipReport) -> Card:
-    columns = {"name": "", "value": "found", "limit": "limit", "unit": "unit", "time": "at [s]"}
     rows = [vars(check) | {"passed": check.passed} for check in report.checks]
-    return table(rows, columns | {"passed": "passed"}), clip_sheet(report)
+    columns = {
+        "name": "",
+        "value": "found",
+        "limit": "limit",
+        "unit": "unit",
+        "time": "at [s]",
+        "passed": "passed",
+    }
+    return table(rows, columns), clip_sheet(report)
 
 
 @themed
@@ -151,8 +165,7 @@ def clip_sheet(report: ClipReport) -> Figure:
     fig = new_figure(PAGE_IN, 4.2)
     axes = fig.subplots(len(report.series), 1, sharex=True)
     for ax, (label, values) in zip(axes, report.series.items(), strict=True):
-        columns = values.T if values.ndim == 2 else [values]
-        for column, opacity in zip(columns, (1.0, 0.45), strict=False):
+        for column, opacity in zip(np.atleast_2d(values.T), (1.0, 0.45), strict=False):
             ax.plot(report.clip.t, column, color=LAUNCH, alpha=opacity)
         for begin, end in report.flights:
             ax.axvspan(begin, end, color=FLIGHT, alpha=0.2, linewidth=0)
@@ -168,22 +181,41 @@ def _of_mended(mended: Mended) -> Card:
 
 def _of_record(record: Record) -> Card:
     rows = [vars(limit) | {"worth": limit.worth} for limit in record.limits[:MOST_BINDING]]
-    columns = {"limit": "binds", "joint": "joint", "phase": "phase", "from_s": "from [s]"}
-    columns |= {"to_s": "to [s]", "worth": "worth of all of it"}
+    columns = {
+        "limit": "binds",
+        "joint": "joint",
+        "phase": "phase",
+        "from_s": "from [s]",
+        "to_s": "to [s]",
+        "worth": "worth of all of it",
+    }
     return table(rows, columns, digits=3), jump_strobe(record.plan.tape, record.plan.robot)
 
 
 def _of_improved(improved: Improved) -> Card:
-    columns = {"number": "number", "unit": "unit", "before": "was", "after": "becomes"}
-    columns |= {"low": "from", "high": "to", "buys": f"gain [{improved.after.unit}]"}
+    columns = {
+        "number": "number",
+        "unit": "unit",
+        "before": "was",
+        "after": "becomes",
+        "low": "from",
+        "high": "to",
+        "buys": f"gain [{improved.after.unit}]",
+    }
     rows = table([vars(x) for x in improved.changes], columns, digits=3)
     return rows, jump_strobe(improved.after.plan.tape, improved.robot)
 
 
 def _of_prices(prices: Prices) -> Card:
     rows = [vars(row) | {"gap": f"{row.gap:.1%}"} for row in prices.rows]
-    columns = {"limit": "limit", "unit": "for one", "price": f"gain [{prices.unit}]"}
-    columns |= {"checked": "with the limit moved", "gap": "differs", "stays": "same limits bind"}
+    columns = {
+        "limit": "limit",
+        "unit": "for one",
+        "price": f"gain [{prices.unit}]",
+        "checked": "with the limit moved",
+        "gap": "differs",
+        "stays": "same limits bind",
+    }
     return table(rows, columns, digits=3), price_bars(prices)
 
 
@@ -198,10 +230,12 @@ def price_bars(prices: Prices) -> Figure:
     size = 1e3 if prices.unit == "m" else 180 / np.pi
     names = [f"{row.limit}, {row.step_words}" for row in rows]
     ax.barh(names, [size * row.price * row.step for row in rows], color=LAUNCH)
-    for kept, face in ((True, FLIGHT), (False, "white")):
+    look = dict(linestyle="none", marker="o", markersize=4, color=FLIGHT, zorder=3)
+    for kept, face, label in (
+        (True, FLIGHT, "with the limit moved"),
+        (False, "white", "the same, other limits bind"),
+    ):
         at = [(size * row.checked * row.step, k) for k, row in enumerate(rows) if row.stays == kept]
-        look = dict(linestyle="none", marker="o", markersize=4, color=FLIGHT, zorder=3)
-        label = "with the limit moved" if kept else "the same, other limits bind"
         ax.plot(*np.array(at).reshape(-1, 2).T, markerfacecolor=face, label=label, **look)
     ax.axvline(0, **LIMIT_STYLE)
     ax.legend(loc="best")

@@ -6,12 +6,14 @@ bend in it, and the planar quantities of its tape; any other one has all of both
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jumplab.auditing.replay import runs
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.legs import size
@@ -61,27 +63,29 @@ MOMENTUM, INERTIA = "$L$ [kg m$^2$/s]", "$\\rho$ [kg m$^2$]"
 PLANAR_CURVES = {
     INERTIA: ("rho", ...),
     MOMENTUM: ("L", ...),
-    "$v_x$ of the CoM [m/s]": ("com_velocity", (..., 0)),
-    "$v_z$ of the CoM [m/s]": ("com_velocity", (..., 1)),
+    "$v_x$ of the CoM [m/s]": ("com_velocity", 0),
+    "$v_z$ of the CoM [m/s]": ("com_velocity", 1),
 }
 # ... and of what is simulated too
 PLANAR_MOTION = {
-    "CoM $x$ [m]": ("com", (..., 0)),
-    "CoM $z$ [m]": ("com", (..., 2)),
+    "CoM $x$ [m]": ("com", 0),
+    "CoM $z$ [m]": ("com", 2),
     f"{MOMENTUM}, launch": ("planar_L", ...),
-    "CoM $v_x$ [m/s]": ("com_velocity", (..., 0)),
-    "CoM $v_z$ [m/s]": ("com_velocity", (..., 2)),
+    "CoM $v_x$ [m/s]": ("com_velocity", 0),
+    "CoM $v_z$ [m/s]": ("com_velocity", 2),
     INERTIA: ("planar_rho", ...),
 }
 
 
 def _components(label: str, name: str) -> dict[str, tuple]:
     """Curves of all three components of an array, which ``label`` calls "?"."""
-    return {label.replace("?", x): (name, (..., k)) for k, x in enumerate("xyz")}
+    return {label.replace("?", x): (name, k) for k, x in enumerate("xyz")}
 
 
-SPATIAL_CURVES = _components("$v_?$ of the CoM [m/s]", "com_velocity")
-SPATIAL_CURVES |= _components("$L_?$ [kg m$^2$/s]", "angular_momentum")
+SPATIAL_CURVES = {
+    **_components("$v_?$ of the CoM [m/s]", "com_velocity"),
+    **_components("$L_?$ [kg m$^2$/s]", "angular_momentum"),
+}
 SPATIAL_MOTION = _components("CoM $?$ [m]", "com") | _components("CoM $v_?$ [m/s]", "com_velocity")
 
 
@@ -97,12 +101,12 @@ def _heel_up_time(tape: Tape) -> float:
 
 def _joints(tape: Tape, robot: Robot) -> dict[str, list[int]]:
     """The joints to show: their columns by title, of one joint or of a pair."""
-    columns: dict[str, list[int]] = {}
+    columns = defaultdict(list)
     in_plane = {name for pair in robot.joints.values() for name in pair}
     for i, name in enumerate(robot.joint_names):
         if name in in_plane or not _in_plane(tape):
             title = name.removeprefix("left_").removeprefix("right_").removesuffix("_joint")
-            columns.setdefault(title.replace("_", " "), []).append(i)
+            columns[title.replace("_", " ")].append(i)
     return columns
 
 
@@ -138,12 +142,11 @@ def joint_trajectories(
         draw dashed, such as stage 2's; of a jump in the plane alone.
     """
     joints = _joints(tape, robot)
-    motors = robot.limits
     signs = {name: (row, sign) for name, row, sign in robot.role_signs()}
     fig = new_figure(PAGE_IN, 4.5 if torques else 3.1)
     axes = fig.subplots(3 if torques else 2, len(joints), sharex=True)
     for column, (title, sides) in zip(axes.T, joints.items(), strict=True):
-        motor = motors[sides[0]]
+        motor = robot.limits[sides[0]]
         panels = (
             (tape.q[:, 7:], (motor.lower, motor.upper)),
             (tape.v[:, 6:], (-motor.speed, motor.speed)),
@@ -185,8 +188,8 @@ def inertia_and_momentum(tape: Tape) -> Figure:
     marks = (_heel_up_time(tape), takeoff)
     curves = {}
     for label, (name, part) in names.items():
-        asked = [(e[f"srmp_{p}_t"] + t, e[f"srmp_{p}_{name}"][part]) for p, t in starts.items()]
-        curves[label] = (tape.t, e[prefix + name][part], tape.phase), asked, marks
+        asked = [(e[f"srmp_{p}_t"] + t, e[f"srmp_{p}_{name}"].T[part]) for p, t in starts.items()]
+        curves[label] = (tape.t, e[prefix + name].T[part], tape.phase), asked, marks
     dashed = "stage 1, the reference" if starts else None
     return _panels(curves, phase_handles("launch", "flight", reference=dashed), 3.3)[0]
 
@@ -222,18 +225,17 @@ def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
 
 def _draw_motor(ax: Axes, motor: MotorLimits, limits: Limits) -> None:
     """A motor's torque against speed, as far as it goes; dashed as far as the planner goes."""
-    corner, free = motor.corner_speed, motor.no_load_speed
-    x = np.array([-free, -corner, 0.0, corner, free])
+    free = motor.no_load_speed
+    x = np.array([-free, -motor.corner_speed, motor.corner_speed, free])
     edges = motor.range(x)
     ax.fill_between(x, *edges, color=BAND, linewidth=0)
     for edge in edges:
         ax.plot(x, edge, **LIMIT_STYLE)
     cut = limits.speed_share * motor.speed
-    rates = np.array([-cut, min(corner, cut), cut, cut])
-    most = limits.torque_share * motor.range(rates)[1]
-    most[-1] = -limits.torque_share * motor.effort
-    for sign in (1, -1):
-        ax.plot(sign * rates, sign * most, **REFERENCE_STYLE)
+    rates = np.clip(x, -cut, cut)
+    least, most = motor.range(rates)
+    around = limits.torque_share * np.append(least, most[::-1])
+    ax.fill(np.append(rates, rates[::-1]), around, fill=False, **REFERENCE_STYLE)
     ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * free, 1.08 * free))
     ax.set_ylim(-1.12 * motor.effort, 1.12 * motor.effort)
 
@@ -274,9 +276,9 @@ def active(plan: JumpPlan, limits: Limits | None = None) -> Figure:
     for k, name in enumerate(names):
         for phase, color in PHASE_COLORS.items():
             used = rows[name] & (tape.phase == phase)
-            edges = np.flatnonzero(np.diff(np.r_[False, used, False].astype(int)))
-            last = len(tape.t) - 1
-            bars = [(tape.t[a], tape.t[min(b, last)] - tape.t[a]) for a, b in edges.reshape(-1, 2)]
+            parts = [part for part in runs(used) if used[part.start]]
+            spans = [tape.t[part.start : part.stop + 1] for part in parts]
+            bars = [(span[0], np.ptp(span)) for span in spans]
             ax.broken_barh(bars, (k - 0.35, 0.7), facecolor=color, edgecolor=color, linewidth=0.8)
     mark_time(ax, (_heel_up_time(tape), tape.takeoff_time))
     ax.set_yticks(range(len(names)), names)
@@ -289,24 +291,23 @@ def active(plan: JumpPlan, limits: Limits | None = None) -> Figure:
 def _used_up(tape: Tape, robot: Robot, limits: Limits) -> dict[str, np.ndarray]:
     """Limit in words -> whether it is used up (N,), of the joints, the soles and the friction."""
     motors = robot.limits
-    speeds, torques = tape.v[:, 6:], tape.tau
-    least, most = (limits.torque_share * edge for edge in motors.range(speeds))
+    angles, speeds = tape.q[:, 7:], tape.v[:, 6:]
+    least, most = (FULL * limits.torque_share * edge for edge in motors.range(speeds))
     room = limits.range_margin_rad + NEAR_STOP_RAD
     by_limit = {
-        "torque": (torques >= FULL * most) | (torques <= FULL * least),
+        "torque": (tape.tau >= most) | (tape.tau <= least),
         "speed": np.abs(speeds) >= FULL * limits.speed_share * motors.speed,
-        "lower stop": tape.q[:, 7:] <= motors.lower + room,
-        "upper stop": tape.q[:, 7:] >= motors.upper - room,
+        "lower stop": angles <= motors.lower + room,
+        "upper stop": angles >= motors.upper - room,
     }
     rows = {}
     for title, sides in _joints(tape, robot).items():
         rows |= {f"{title}, {what}": used[:, sides].any(axis=1) for what, used in by_limit.items()}
     ground = ground_reaction(tape, robot)
     launch = tape.phase == "launch"
-    length = robot.foot.toe - robot.foot.heel
-    back = ground["cop_x"] + length - limits.cop_margin_m
+    heel = robot.foot.heel - robot.foot.toe + limits.cop_margin_m
     for what, used in {
-        "CoP at the heel": back <= NEAR_EDGE_M,
+        "CoP at the heel": ground["cop_x"] <= heel + NEAR_EDGE_M,
         "CoP at the toe": ground["cop_x"] >= -NEAR_EDGE_M,
         "friction": ground["friction"] >= FULL * limits.friction,
     }.items():
@@ -374,19 +375,17 @@ def _strip_rows(record: SimulationResult | Tape, height: np.ndarray) -> np.ndarr
     """Rows of the frames: beginning, deepest and end of each time on the ground, some of each
     flight.
     """
-    end = len(record.t) - 1
-    edges = np.flatnonzero(record.phase[1:] != record.phase[:-1]) + 1
-    pieces = np.split(np.arange(end + 1), edges)
+    pieces = runs(record.phase)
     if len(pieces) == 1:  # it never left the ground
-        return np.linspace(0, end, 5).astype(int)
+        return np.linspace(0, len(record.t) - 1, 5).astype(int)
     shares = FLIGHT_SHARES if len(pieces) < 4 else FLIGHT_SHARES[1:2]
     rows = []
     for piece in pieces:
-        first, last = int(piece[0]), int(piece[-1])
+        first, last = piece.start, piece.stop - 1
         if record.phase[first] == "flight":
             rows += [first + int(share * (last - first)) for share in shares]
-            continue
-        rows += [first, first + int(np.argmin(height[piece])), last]
+        else:
+            rows += [first, first + np.argmin(height[piece]), last]
     return np.array(rows)
 
 
@@ -399,15 +398,12 @@ def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     """
     curves = {}
     for label, (name, part) in (PLANAR_MOTION if _in_plane(tape) else SPATIAL_MOTION).items():
-        actual = getattr(result, name.removeprefix("planar_"))[part]
-        planned = tape.extra[name][part]
-        seen = result.t <= tape.t[-1] + AFTER_TOUCHDOWN_S
-        kept = slice(None)
-        marks = [tape.takeoff_time]
-        if label.endswith("launch"):
-            seen = result.phase == "launch"
-            kept = tape.phase == "launch"
-            marks = []
+        actual = getattr(result, name.removeprefix("planar_")).T[part]
+        planned = tape.extra[name].T[part]
+        launch = label.endswith("launch")
+        seen = result.phase == "launch" if launch else result.t <= tape.t[-1] + AFTER_TOUCHDOWN_S
+        kept = tape.phase == "launch" if launch else slice(None)
+        marks = [] if launch else [tape.takeoff_time]
         curve = (result.t[seen], actual[seen], result.phase[seen])
         curves[label] = curve, [(tape.t[kept], planned[kept])], marks
     fig, axes = _panels(curves, phase_handles(*PHASE_COLORS, reference="plan"), 3.4)

@@ -50,9 +50,8 @@ def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
         name: palette[(i + 1) % len(palette)]
         for i, name in enumerate(sorted({cell.limiting for cell in cells if cell.solved}))
     }
-    entries = [(color, name) for name, color in colors.items()]
-    entries += [look for kind, look in REFUSED.items() if kind in limiting]
-    handles = [Patch(color=color, label=label) for color, label in entries]
+    entries = colors | {words: x for kind, (x, words) in REFUSED.items() if kind in limiting}
+    handles = [Patch(color=color, label=label) for label, color in entries.items()]
     if others:
         rows = -(-len(maps) // COLUMNS)
         fig = new_figure(PAGE_IN, 0.9 + 1.75 * rows)
@@ -81,12 +80,13 @@ def _draw_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: s
         face = REFUSED.get(cell.limiting, ("", ""))[0]
         if cell.solved:
             face = tint(colors[cell.limiting], 0.25 + 0.75 * float(np.clip(cell.share, 0, 1)))
-            look = dict(ha="center", va="center", fontsize=5.5)
-            luminance = np.dot((0.2126, 0.7152, 0.0722), np.array(face[:3]) ** 2.2)
-            look["color"] = "black" if luminance > 0.2 else "white"
-            ax.text(*place, f"{100 * cell.share:.0f}", **look)
-        look = dict(facecolor=face, edgecolor="white", linewidth=0.6)
-        ax.add_patch(Rectangle(place - size / 2, *size, **look))
+            luminance = np.dot((0.2126, 0.7152, 0.0722), np.array(face) ** 2.2)
+            ink = "black" if luminance > 0.2 else "white"
+            share = f"{100 * cell.share:.0f}"
+            ax.text(*place, share, ha="center", va="center", fontsize=5.5, color=ink)
+        ax.add_patch(
+            Rectangle(place - size / 2, *size, facecolor=face, edgecolor="white", linewidth=0.6)
+        )
     ax.autoscale_view()
     ax.margins(0)
     if max(map(len, centres)) <= MOST_TICKS:

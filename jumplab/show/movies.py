@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib import import_module, resources
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
     from jumplab.sim import SimulationResult
 
-KINDS = {"gif": ("image/gif", (480, 270)), "mp4": ("video/mp4", (848, 480))}  # type, size [pixels]
-RATES = {"gif": 20.0, "mp4": 30.0}  # frames a second
+# type, size [pixels], frames a second
+KINDS = {"gif": ("image/gif", (480, 270), 20.0), "mp4": ("video/mp4", (848, 480), 30.0)}
 LIBRARIES = {"egl": "MuJoCo, EGL", "osmesa": "MuJoCo, OSMesa"}  # of OpenGL without a display
 # how fast it is shown, and how much of the standing
 SPEED = 0.5
@@ -82,12 +82,7 @@ class Movie:
         return write_file(path, self.data)
 
     def _repr_html_(self) -> str:
-        return filled(
-            "show/movie.html",
-            kind=self.kind,
-            type=KINDS[self.kind][0],
-            data=self.data,
-        )
+        return filled("show/movie.html", kind=self.kind, type=KINDS[self.kind][0], data=self.data)
 
 
 def movie(
@@ -115,7 +110,8 @@ def movie(
     if kind not in KINDS:
         raise InputError(f"a movie must be one of {', '.join(KINDS)}, got {kind!r}")
     robot, record, scene = _subject(of, record, scene)
-    rate = RATES[kind] / SPEED
+    _, size, fps = KINDS[kind]
+    rate = fps / SPEED
     whole = Motion.of(record)
     motion = whole.every(rate)
     landing = motion.t[motion.phase == "landing"]
@@ -123,7 +119,6 @@ def movie(
     way = trace(robot, motion.q[shown])
     looks, distance_m = camera(way, rate)
     pressed = ground_forces(whole, rate, way, scene) if forces else None
-    size = KINDS[kind][1]
     pictures = []
     name, renderer = _renderer(_world(robot, scene, way.toes(robot)[[0, -1]].tolist()), size)
     with renderer:
@@ -131,14 +126,12 @@ def movie(
             tell("drawing frame", k + 1, len(looks))
             arrows = () if pressed is None else _arrows(pressed[k], robot)
             view = _camera_at(look, distance_m)
-            phase = str(motion.phase[k])
-            picture = Image.fromarray(_draw(renderer, way.joints[k], view, phase, arrows))
-            picture = picture.reduce(FINER)
+            picture = _draw(renderer, way.joints[k], view, str(motion.phase[k]), arrows)
             words = f"{motion.t[k] - motion.t[0]:.2f} s, half speed"
             ImageDraw.Draw(picture).text((10, size[1] - 22), words, fill=INK)
             pictures.append(picture)
-    lasts_s = len(pictures) / RATES[kind]
-    return Movie(_encode(pictures, kind), kind, len(pictures), lasts_s, name)
+    count = len(pictures)
+    return Movie(_encode(pictures, kind, fps), kind, count, count / fps, name)
 
 
 def _subject(of: Any, record: Any, scene: Scene | None) -> tuple[Robot, Any, Scene]:
@@ -165,19 +158,19 @@ def camera(way: Trace, rate_hz: float) -> tuple[np.ndarray, float]:
     still unless the jump is long.
     """
     base = way.joints[:, 0, :2]
-    height = way.joints[..., 2].max(axis=1)  # of the highest joint
-    top = height.max() + HEAD * height[0]
-    low = way.joints[..., 2].min() - LOW * height[0]
-    looks = np.empty((len(base), 3))
+    heights = way.joints[..., 2]
+    tall = heights[0].max()  # the highest joint at first
+    top = heights.max() + HEAD * tall
+    low = heights.min() - LOW * tall
+    looks = np.full((len(base), 3), (top + low) / 2)
     looks[:, :2] = (base.min(axis=0) + base.max(axis=0)) / 2
-    looks[:, 2] = (top + low) / 2
     long = np.ptp(base[:, 0])
     if long > FIXED_M:
         width = max(1, round(GLIDE_S * rate_hz)) | 1
         looks[:, :2] = uniform_filter1d(base, width, axis=0, mode="nearest")
         long = 0.0
     wide, high = KINDS["gif"][1]
-    half = max(top - low, (long + AROUND * height[0]) * high / wide) / 2
+    half = max(top - low, (long + AROUND * tall) * high / wide) / 2
     return looks, half / np.tan(np.radians(OPENING_DEG) / 2)
 
 
@@ -197,16 +190,22 @@ def write_movie(
     return film
 
 
-def _encode(pictures: Sequence[Image.Image], kind: str) -> bytes:
+def _encode(pictures: Sequence[Image.Image], kind: str, fps: float) -> bytes:
     if kind == "mp4":
-        coding = dict(codec="libx264", pixelformat="yuv420p", macro_block_size=2, fps=RATES[kind])
-        where = dict(extension=".mp4", plugin="FFMPEG")
-        return images.imwrite("<bytes>", np.stack(pictures), **where, **coding)
+        return images.imwrite(
+            "<bytes>",
+            np.stack(pictures),
+            extension=".mp4",
+            plugin="FFMPEG",
+            codec="libx264",
+            pixelformat="yuv420p",
+            macro_block_size=2,
+            fps=fps,
+        )
     some = np.vstack(pictures[:: max(1, len(pictures) // 6)])
     palette = Image.fromarray(some).quantize(COLORS)
-    plain = dict(palette=palette, dither=Image.Dither.NONE)
-    first, *others = (picture.quantize(**plain) for picture in pictures)
-    pause = round(1000 / RATES[kind])  # [ms]
+    first, *others = (x.quantize(palette=palette, dither=Image.Dither.NONE) for x in pictures)
+    pause = round(1000 / fps)  # [ms]
     buffer = io.BytesIO()
     first.save(buffer, "GIF", save_all=True, append_images=others, duration=pause, loop=0)
     return buffer.getvalue()
@@ -248,9 +247,9 @@ def _draw(
     poses: np.ndarray,
     camera: mujoco.MjvCamera,
     phase: str,
-    arrows: Sequence[tuple[np.ndarray, np.ndarray]] = (),
-) -> np.ndarray:
-    """Pixels (h, w, 3) of the joints at ``poses`` (njoints - 1, 7), and of arrows [m]."""
+    arrows: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> Image.Image:
+    """The joints at ``poses`` (njoints - 1, 7), and arrows [m]."""
     import mujoco
 
     model = renderer.model
@@ -268,32 +267,37 @@ def _draw(
         mujoco.mjv_initGeom(arrow, kind, np.zeros(3), np.zeros(3), np.zeros(9), ARROW_RGBA)
         mujoco.mjv_connector(arrow, kind, ARROW_RADIUS_M, start, end)
         scene.ngeom += 1
-    return renderer.render()
+    return Image.fromarray(renderer.render()).reduce(FINER)
 
 
-def _world(robot: Robot, scene: Scene, marks_m: Sequence[float] = ()) -> mujoco.MjModel:
-    """Sky and light of ``world.xml``, the ground with lines across, and the robot's parts on a body
-    per joint.
+def _world(robot: Robot, scene: Scene, marks_m: Sequence[float]) -> mujoco.MjModel:
+    """Sky and light of ``world.xml``, the ground with lines across, counted from the first of the
+    marks, and the robot's parts on a body per joint.
     """
     import mujoco
 
-    text = (resources.files("jumplab.show") / "world.xml").read_text(encoding="utf-8")
-    spec = mujoco.MjSpec.from_string(text)
+    spec = mujoco.MjSpec.from_string(filled("show/world.xml"))
     box = mujoco.mjtGeom.mjGEOM_BOX
     for half, middle, turn in scene.within(*SHOWN_M, 4.0).boxes():
-        place = dict(size=half, pos=middle, quat=np.roll(turn, 1))
-        spec.worldbody.add_geom(type=box, material="floor", **place)
-    if marks_m:
-        counts = np.arange(*np.round(np.array(SHOWN_M) / LINE_M))
-        lines = [(marks_m[0] + LINE_M * k, 0.0, LINE_RGBA) for k in counts]
-        for x, lift, color in [*lines, *((x, 0.001, MARK_RGBA) for x in marks_m)]:
-            at = [x, 0.0, scene.top_at(x) + lift]
-            spec.worldbody.add_geom(type=box, size=LINE_HALF_M, pos=at, rgba=color)
+        quat = np.roll(turn, 1)
+        spec.worldbody.add_geom(type=box, material="floor", size=half, pos=middle, quat=quat)
+    lines = [(x, 0.0, LINE_RGBA) for x in marks_m[0] + np.arange(*SHOWN_M, LINE_M)]
+    for x, lift, color in [*lines, *((x, 0.001, MARK_RGBA) for x in marks_m)]:
+        at = [x, 0.0, scene.top_at(x) + lift]
+        spec.worldbody.add_geom(type=box, size=LINE_HALF_M, pos=at, rgba=color)
     bodies = [spec.worldbody.add_body(mocap=True) for _ in range(1, robot.model.njoints)]
     for number, part in enumerate(parts_of(robot)[0]):
-        surface = dict(uservert=part.points.ravel(), userface=part.triangles.ravel())
-        shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open surfaces too
-        spec.add_mesh(name=f"{number}", inertia=shell, **surface)
-        look = dict(meshname=f"{number}", material=part.kind, contype=0, conaffinity=0)
-        bodies[part.joint - 1].add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, **look)
+        mesh = spec.add_mesh(
+            name=f"{number}",
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,  # open surfaces too
+            uservert=part.points.ravel(),
+            userface=part.triangles.ravel(),
+        )
+        bodies[part.joint - 1].add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=mesh.name,
+            material=part.kind,
+            contype=0,
+            conaffinity=0,
+        )
     return spec.compile()

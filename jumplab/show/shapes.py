@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -53,6 +54,7 @@ VISOR = np.array([[0.62, 0.0, 0.2], [0.45, 0.8, 0.3]])
 _CIRCLE = np.exp(1j * np.arange(16) * np.pi / 8)
 _HEIGHTS = np.exp(1j * np.linspace(-np.pi / 2, np.pi / 2, 9))
 BALL = np.array([(a.real * h.real, a.imag * h.real, h.imag) for h in _HEIGHTS for a in _CIRCLE])
+CORNERS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
 DISC = np.array([(a.real, side, a.imag) for side in (-1.0, 1.0) for a in _CIRCLE])
 
 
@@ -105,12 +107,14 @@ def pressure_points(
 
     NaN where a foot is pressed with ``least_n`` [N] or less.
     """
-    pressed = np.where(wrench[..., 2] > least_n, wrench[..., 2], np.nan)
-    above = feet[..., 2] - height
+    f_x, f_y, f_z, m_x, m_y, _ = np.moveaxis(wrench, -1, 0)
+    x, y, z = np.moveaxis(feet, -1, 0)
+    pressed = np.where(f_z > least_n, f_z, np.nan)
+    above = z - height
     # the moment about this point of the ground has no horizontal part
-    x = feet[..., 0] - (wrench[..., 4] + above * wrench[..., 0]) / pressed
-    y = feet[..., 1] + (wrench[..., 3] - above * wrench[..., 1]) / pressed
-    return np.stack([x, y, height + 0 * pressed], axis=-1)
+    ahead = x - (m_y + above * f_x) / pressed
+    left = y + (m_x - above * f_y) / pressed
+    return np.stack([ahead, left, height + 0 * pressed], axis=-1)
 
 
 def ground_forces(whole: Motion, rate_hz: float, way: Trace, scene: Scene) -> np.ndarray | None:
@@ -190,8 +194,7 @@ class _Box(NamedTuple):
     def rounded(self, share: float) -> np.ndarray:
         """Points (n, 3) of the box, the radius of its edges a ``share`` of the least width."""
         radius = share * 2 * self.half.min()
-        inner = zip(radius - self.half, self.half - radius, strict=True)
-        corners = np.array(list(itertools.product(*inner)))
+        corners = CORNERS * (self.half - radius)
         return placed(self.place, (corners[:, None] + radius * BALL).reshape(-1, 3))
 
     def inside(self, share: np.ndarray) -> np.ndarray:
@@ -199,26 +202,22 @@ class _Box(NamedTuple):
         return placed(self.place, share * self.half)
 
 
-def _boxes(robot: Robot) -> list[_Box]:
+def _boxes(robot: Robot) -> Iterator[_Box]:
     """The boxes around the shapes of a robot's URDF; none if these are meshes.
 
     Raises :class:`RobotError` if Pinocchio cannot read the shapes.
     """
-    kind = pin.GeometryType.VISUAL
     try:
-        geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, kind)
+        geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.VISUAL)
     except ValueError as e:
         if "mesh" in str(e).lower():
-            return []
-        reason = str(e).splitlines()[0]
-        raise RobotError(f"robot {robot.name}: Pinocchio cannot read its shapes: {reason}") from e
-    boxes = []
+            return
+        raise robot.error(f"Pinocchio cannot read its shapes: {str(e).splitlines()[0]}") from e
     for shape in geometry.geometryObjects:
         shape.geometry.computeLocalAABB()
         box = shape.geometry.aabb_local
         place = shape.placement * pin.SE3(np.eye(3), (box.max_ + box.min_) / 2)
-        boxes.append(_Box(shape.parentJoint, place, (box.max_ - box.min_) / 2))
-    return boxes
+        yield _Box(shape.parentJoint, place, (box.max_ - box.min_) / 2)
 
 
 def rounded_body(robot: Robot) -> list[Part]:
@@ -230,12 +229,12 @@ def rounded_body(robot: Robot) -> list[Part]:
     model = robot.model
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
-    boxes: dict[int, list[_Box]] = {}
+    boxes = defaultdict(list)
     for box in _boxes(robot):
-        boxes.setdefault(box.joint, []).append(box)
+        boxes[box.joint].append(box)
     for role in LEG[1:]:  # thighs and shanks are drawn even without boxes
         for name in robot.joints[role]:
-            boxes.setdefault(model.parents[model.getJointId(name)], [])
+            boxes[model.parents[model.getJointId(name)]] += []
     # a joint without a box is drawn with the next one below that has one, or with its parent
     ends = _ends(model, boxes.keys())
     parts = []
@@ -243,8 +242,8 @@ def rounded_body(robot: Robot) -> list[Part]:
         kind = _kind(robot, joint)
         if kind == "trunk":
             continue
-        radius = END_SHARE * min((2 * box.half.min() for box in joint_boxes), default=2 * LIMB_M)
-        radius = max(radius, END_SHARE * LIMB_M)
+        width = min((2 * box.half.min() for box in joint_boxes), default=2 * LIMB_M)
+        radius = END_SHARE * max(width, LIMB_M)
         rounding = SOLE_ROUNDING if kind == "rest" else ROUNDING
         balls = [
             data.oMi[joint].actInv(data.oMi[end].translation) + radius * BALL
@@ -252,14 +251,14 @@ def rounded_body(robot: Robot) -> list[Part]:
         ]
         solid = np.concatenate([*(box.rounded(rounding) for box in joint_boxes), *balls])
         parts.append(_hull(joint, kind, solid))
-    return [*parts, *_trunk(robot, data, boxes.get(1, [])), *_discs(robot)]
+    return [*parts, *_trunk(robot, data, boxes[1]), *_discs(robot)]
 
 
 def _ends(model: pin.Model, drawn: Collection[int]) -> dict[int, list[int]]:
     """Joints where a drawn one's limb ends: those above it that are not drawn, up to the trunk, and
     those that it carries.
     """
-    ends: dict[int, list[int]] = {joint: [] for joint in drawn}
+    ends = {joint: [] for joint in drawn}
     for joint in range(2, model.njoints):
         below = next((j for j in model.subtrees[joint] if j in ends), None)
         if joint not in ends and below is not None:
@@ -285,8 +284,7 @@ def _trunk(robot: Robot, data: pin.Data, boxes: list[_Box]) -> Iterator[Part]:
     top = max(boxes, key=lambda box: box.middle[2])
     above = top.middle[2] - top.half[2] > shoulders - LIMB_M
     has_head = above and top.half.prod() < max(box.half.prod() for box in boxes)
-    middles = [box.middle for box in boxes]
-    yield _hull(1, "trunk", np.concatenate([x + LIMB_M * BALL for x in middles]))
+    yield _hull(1, "trunk", np.concatenate([box.middle + LIMB_M * BALL for box in boxes]))
     for box in boxes:
         head = has_head and box is top
         yield _hull(1, "trunk", box.rounded(HEAD_ROUNDING if head else ROUNDING))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib import resources
 from pathlib import Path
 from threading import RLock
 from typing import Any
@@ -25,6 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jumplab.arguments import shaped
+from jumplab.auditing.replay import runs
 from jumplab.errors import InputError, quoted
 from jumplab.forms import filled
 from jumplab.io.folder import versions, write_file
@@ -55,9 +55,9 @@ BAND = (0.928, 0.928, 0.928)  # fill of what is allowed between two bounds
 # keywords of Axes.annotate
 NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}
 # of the style, in points: they grow with a font.size of the user's
-TEXT_SIZES = [f"{of}.labelsize" for of in ("axes", "xtick", "ytick")]
-TEXT_SIZES += ["axes.titlesize", "legend.fontsize"]
-STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
+TEXT_SIZES = """axes.labelsize xtick.labelsize ytick.labelsize axes.titlesize
+    legend.fontsize""".split()
+STYLE_FILE = Path(__file__).with_name("jumplab.mplstyle")
 
 
 def use_style() -> None:
@@ -78,9 +78,7 @@ def _style(whole: bool) -> Iterator[None]:
         settings = {} if whole else {k: v for k, v in _ours().items() if v != rcParamsDefault[k]}
         with plt.style.context(STYLE_FILE):
             larger = settings.get("font.size", rcParams["font.size"]) / rcParams["font.size"]
-            for key in (key for key in TEXT_SIZES if key not in settings):
-                rcParams[key] *= larger
-            rcParams.update(settings)
+            rcParams.update({key: larger * rcParams[key] for key in TEXT_SIZES} | settings)
             yield
 
 
@@ -167,13 +165,13 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
 
     ``phase`` holds names of :data:`PHASE_COLORS`; further keywords go to ``Axes.plot``.
     """
-    t, y = (shaped(x, (len(phase),), name) for x, name in ((t, "t"), (y, "y")))
+    t = shaped(t, (len(phase),), "t")
+    y = shaped(y, (len(phase),), "y")
     if unknown := sorted({*map(str, phase)} - {*PHASE_COLORS}):
         raise InputError(f"phase {unknown[0]!r}: must be one of {', '.join(PHASE_COLORS)}")
-    cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
     lines = []
-    for rows in np.split(np.arange(len(phase)), cuts):
-        look = {"color": PHASE_COLORS[str(phase[rows[0]])]} | kwargs
+    for rows in runs(phase):
+        look = {"color": PHASE_COLORS[str(phase[rows.start])]} | kwargs
         try:
             lines += ax.plot(t[rows], y[rows], **look)
         except (AttributeError, TypeError, ValueError) as e:
@@ -219,10 +217,9 @@ def phase_handles(
     *phases: str, reference: str | None = None, limit: str | None = None
 ) -> list[Line2D]:
     """Legend entries: phases by name, then texts (if any) for dashed reference and thin limits."""
-    handles = [Line2D([], [], color=PHASE_COLORS[p], label=p) for p in phases]
-    for text, look in ((reference, REFERENCE_STYLE), (limit, LIMIT_STYLE)):
-        handles += [Line2D([], [], **look, label=text)] if text else []
-    return handles
+    looks = {phase: {"color": PHASE_COLORS[phase]} for phase in phases}
+    looks |= {reference: REFERENCE_STYLE, limit: LIMIT_STYLE}
+    return [Line2D([], [], **look, label=text) for text, look in looks.items() if text]
 
 
 def legend_above(fig: Figure, handles: list[Artist]) -> None:
@@ -233,8 +230,7 @@ def legend_above(fig: Figure, handles: list[Artist]) -> None:
 def panel_letters(axes: Iterable[Axes]) -> None:
     """(a), (b), ... before the panels' titles."""
     for letter, ax in zip("abcdefghijklmnop", axes, strict=False):
-        title = f"({letter}) {ax.get_title(loc='left')}"
-        ax.set_title(title.rstrip())
+        ax.set_title(f"({letter}) {ax.get_title(loc='left')}".rstrip())
 
 
 def bare(ax: Axes) -> None:
@@ -265,8 +261,9 @@ def save_figure(
     :class:`InputError` if ``name`` is not a plain file name, or the folder cannot be written.
     """
     if not name or Path(name).name != name or name.startswith("."):
-        must = "must be a plain file name without ending, such as 'f08_joints'"
-        raise InputError(f"figure name {name!r}: {must}")
+        raise InputError(
+            f"figure name {name!r}: must be a plain file name without ending, such as 'f08_joints'"
+        )
     png = file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
     fig.set_layout_engine("none")
     pdf = file_of(fig, "pdf", metadata=PDF_METADATA)
@@ -281,33 +278,37 @@ def save_figure(
 
 def made_with() -> str:
     """The installed packages that shape a result, with their versions."""
-    pairs = versions().items()
-    return ", ".join(f"{name} {number}" for name, number in pairs if number != "not installed")
+    return ", ".join(
+        f"{name} {number}" for name, number in versions().items() if number != "not installed"
+    )
 
 
 def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -> str:
     """Text of NAME.txt: caption, target (or targets), robot and versions, one line each."""
     tasks = [task] if isinstance(task, JumpTask) else task or ()
-    facts = {"robot": robot, "made_with": made_with(), "caption": caption.strip()}
-    return filled("show/caption.txt", tasks=[*map(describe_task, tasks)], **facts)
+    return filled(
+        "show/caption.txt",
+        caption=caption.strip(),
+        tasks=[*map(describe_task, tasks)],
+        robot=robot,
+        made_with=made_with(),
+    )
 
 
 def describe_task(task: JumpTask) -> str:
     """The target in words, such as "1.00 m forward, CoM rise 0.50 m"."""
-    words = [f"{abs(task.distance_m):.2f} m {'forward' if task.distance_m >= 0 else 'backward'}"]
-    if task.side_m:
-        words.append(f"{abs(task.side_m):.2f} m to the {'left' if task.side_m > 0 else 'right'}")
-    words.append(f"CoM rise {task.height_m:.2f} m")
-    if task.yaw_rad:
-        words.append(f"turn {np.degrees(task.yaw_rad):.0f} deg")
-    if task.platform_m:
-        level = "higher" if task.platform_m > 0 else "lower"
-        words.append(f"landing {abs(task.platform_m):.2f} m {level}")
-    if task.rotation_rad:
-        words.append(f"rotation {np.degrees(task.rotation_rad):.0f} deg")
-    if task.run_up:
-        words.append(f"run-up of {task.run_up} step{'s' * (task.run_up > 1)}")
-    for word, feet in (("take-off from", task.takeoff), ("landing on", task.landing)):
-        if feet != "both":
-            words.append(f"{word} the {feet} foot")
-    return ", ".join(words)
+    way = "forward" if task.distance_m >= 0 else "backward"
+    side = "left" if task.side_m > 0 else "right"
+    level = "higher" if task.platform_m > 0 else "lower"
+    words = {
+        f"{abs(task.distance_m):.2f} m {way}": True,
+        f"{abs(task.side_m):.2f} m to the {side}": task.side_m,
+        f"CoM rise {task.height_m:.2f} m": True,
+        f"turn {np.degrees(task.yaw_rad):.0f} deg": task.yaw_rad,
+        f"landing {abs(task.platform_m):.2f} m {level}": task.platform_m,
+        f"rotation {np.degrees(task.rotation_rad):.0f} deg": task.rotation_rad,
+        f"run-up of {task.run_up} step{'s' * (task.run_up > 1)}": task.run_up,
+        f"take-off from the {task.takeoff} foot": task.takeoff != "both",
+        f"landing on the {task.landing} foot": task.landing != "both",
+    }
+    return ", ".join(text for text, said in words.items() if said)

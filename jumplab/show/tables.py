@@ -37,8 +37,9 @@ class Table:
 
     def _repr_html_(self) -> str:
         sides = ["right" if right else "left" for right in self.right]
-        facts = {"columns": self.columns, "rows": self.rows, "most": MOST_ROWS}
-        return filled("show/table.html", sides=sides, **facts)
+        return filled(
+            "show/table.html", columns=self.columns, rows=self.rows, sides=sides, most=MOST_ROWS
+        )
 
 
 def table(
@@ -86,5 +87,6 @@ def _text(x: Any, form: str) -> str:
 
 def versions() -> Table:
     """The versions of Python and of every package that shapes a result."""
-    rows = folder.versions().items()
-    return table([{"package": name, "version": version} for name, version in rows])
+    return table(
+        [{"package": name, "version": version} for name, version in folder.versions().items()]
+    )

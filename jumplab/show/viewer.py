@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from jumplab.arguments import checked
+from jumplab.auditing.replay import runs
 from jumplab.errors import InputError
 from jumplab.forms import filled
-from jumplab.io.folder import write_file
+from jumplab.io.folder import plain, write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.robot import Robot
 from jumplab.robot.files import LEG
@@ -51,12 +52,8 @@ class Page:
         return write_file(path, self.html.encode())
 
     def _repr_html_(self) -> str:
-        return filled(
-            "show/frame.html",
-            page=self.html,
-            title=self.title,
-            height=NOTEBOOK_HEIGHT_PX,
-        )
+        height = NOTEBOOK_HEIGHT_PX
+        return filled("show/frame.html", page=self.html, title=self.title, height=height)
 
 
 def page_of(form: Path, title: str, **facts: Any) -> Page:
@@ -90,12 +87,12 @@ def page(
         raise InputError("a page needs a plan or a simulation to show")
     scene = scene or Scene.flat()
     parts, notes = parts_of(robot)
-    toe = robot.foot.toe - float(robot.foot.center[0])
+    toe = robot.foot.toe - robot.foot.center[0]
     marks = [toe + goal for goal in (0.0, *([task.distance_m] if task else []), *marks_m)]
     ways = {name: trace(robot, motion.every(FPS).q) for name, motion in motions.items()}
     places = np.concatenate([marks, *(way.com[:, 0] for way in ways.values())])
-    span = float(places.min() - AHEAD_M), float(places.max() + AHEAD_M)
-    top = float(max(motion.q[:, 2].max() for motion in motions.values()) + ABOVE_M)
+    span = places.min() - AHEAD_M, places.max() + AHEAD_M
+    top = max(motion.q[:, 2].max() for motion in motions.values()) + ABOVE_M
     ground, low = _ground(scene, span)
     first, last = (np.array(span) - toe) / RULER_M
     ruler = RULER_M * np.arange(np.ceil(first), np.floor(last) + 1)
@@ -106,7 +103,7 @@ def page(
         "fps": FPS,
         "weight": robot.total_mass * robot.gravity,
         "parts": list(map(_part, parts)),
-        "joints": list(robot.joint_names),
+        "joints": robot.joint_names,
         "clips": [
             {"name": name, **_clip(motion, robot, scene, ways[name])}
             for name, motion in motions.items()
@@ -115,7 +112,7 @@ def page(
         "marks": [[x, 0.0, scene.top_at(x)] for x in marks],
         "ruler": [
             {"at": [toe + x, -TRACK_HALF_WIDTH_M, scene.top_at(toe + x)], "text": f"{x:g} m"}
-            for x in ruler.tolist()
+            for x in ruler
         ],
         "view": {"x": span, "z": [low, top], "width": 2 * TRACK_HALF_WIDTH_M},
         "colors": PAINTS,
@@ -130,13 +127,9 @@ def _assemble(title: str, facts: Mapping[str, Any]) -> str:
     engine = (resources.files("meshcat") / "viewer" / "dist" / "main.min.js").read_text("utf-8")
     if "</script" in engine:
         raise InputError("this version of meshcat cannot be put into a page; install another one")
-    data = json.dumps(facts, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return filled(
-        "show/page.html",
-        title=title,
-        engine=engine,
-        facts=data.replace("<", "\\u003c"),
-    )
+    data = json.dumps(plain(facts), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    data = data.replace("<", "\\u003c")
+    return filled("show/page.html", title=title, engine=engine, facts=data)
 
 
 def _ground(scene: Scene, span: tuple[float, float]) -> tuple[list[dict[str, Any]], float]:
@@ -145,7 +138,7 @@ def _ground(scene: Scene, span: tuple[float, float]) -> tuple[list[dict[str, Any
     low = min(block.top for block in seen.blocks) - TRACK_DEPTH_M
     blocks = tuple(replace(block, thickness=block.top - low) for block in seen.blocks)
     boxes = [
-        {"size": (2 * half).tolist(), "middle": middle.tolist(), "turn": turn.tolist()}
+        {"size": 2 * half, "middle": middle, "turn": turn}
         for half, middle, turn in replace(seen, blocks=blocks).boxes()
     ]
     return boxes, min(0.0, low)
@@ -157,14 +150,12 @@ def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, An
     """Data with which the page plays a motion that goes this way."""
     motion = whole.every(FPS)
     forces = ground_forces(whole, FPS, way, scene)
-    words = [_words(*row) for row in zip(motion.phase, motion.contact, strict=True)]
-    cuts = [k for k, word in enumerate(words) if k == 0 or word != words[k - 1]]
+    words = np.array(list(map(_words, motion.phase, motion.contact)))
+    cuts = [part.start for part in runs(words)]
     return {
         "bodies": way.joints.shape[1],
         "frames": len(motion.t),
-        "phases": [
-            [float(motion.t[k] - motion.t[0]), str(motion.phase[k]), words[k]] for k in cuts
-        ],
+        "phases": [[motion.t[k] - motion.t[0], motion.phase[k], words[k]] for k in cuts],
         "poses": _packed(way.joints),
         "path": _packed(way.com),
         "forces": None if forces is None else _packed(forces),
@@ -175,24 +166,19 @@ def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, An
 def _words(phase: str, contact: np.ndarray) -> str:
     """The name of a phase, with the foot that carries if it is one alone before the last flight."""
     if phase != "launch" or contact.all() or not contact.any():
-        return str(phase)
+        return phase
     return f"{phase}, {('left', 'right')[int(contact[1])]} foot"
 
 
 def _part(part: Part) -> dict[str, Any]:
     """A surface, its joint counted from the base on."""
-    return {
-        "joint": part.joint - 1,
-        "kind": part.kind,
-        "faceted": part.faceted,
-        "points": _packed(part.points),
-        "triangles": _packed(part.triangles),
-    }
+    packed = {name: _packed(getattr(part, name)) for name in ("points", "triangles")}
+    return vars(part) | packed | {"joint": part.joint - 1}
 
 
 def _packed(values: np.ndarray) -> str:
     """Base64 of numbers as 32-bit floats."""
-    return base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
+    return base64.b64encode(values.astype("<f4").tobytes()).decode()
 
 
 def _values(

@@ -27,12 +27,18 @@ def waiting(out: TextIO, head: str = "", first: str = "") -> Iterator[None]:
 
     A thread of its own keeps it up to date: a solve, or a robot's meshes, say nothing for long.
     """
-    form = "{desc}, {elapsed_s:.0f} s"
-    timing = dict(delay=0.0 if first else FIRST_S, mininterval=REDRAW_S, miniters=0)
-    shape = dict(bar_format=form, leave=False, ncols=WIDTH, nrows=20)
-    begin = head + first if first else None
     count = ""
-    with tqdm(desc=begin, file=out, **shape, **timing) as bar:
+    with tqdm(
+        desc=head + first if first else None,
+        file=out,
+        bar_format="{desc}, {elapsed_s:.0f} s",
+        leave=False,
+        ncols=WIDTH,
+        nrows=20,
+        delay=0.0 if first else FIRST_S,
+        mininterval=REDRAW_S,
+        miniters=0,
+    ) as bar:
 
         def hear(what: str, done: int, of: int) -> None:
             nonlocal count
