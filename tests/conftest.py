@@ -26,6 +26,14 @@ def bhr():
     return Robot.load()
 
 
+@pytest.fixture(scope="session")
+def tape():
+    """A small jump of the default robot, by the direct planner."""
+    from fixtures_core import jump
+
+    return jump(0.6, 0.3, method="direct").tape
+
+
 @pytest.fixture
 def odd_folder(tmp_path):
     """A folder whose path has a space, letters beyond ASCII, braces and a dollar sign."""

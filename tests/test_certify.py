@@ -6,7 +6,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from fixtures_core import jump
+from fixtures_core import on_file
 from paper import certify as certificates
 from paper.certify import QUANTITIES, certificate_page, certify
 from test_store import names
@@ -28,9 +28,7 @@ def held(folder) -> set[str]:
 
 @pytest.fixture
 def folder(tmp_path):
-    plan = jump(0.6, 0.3, method="direct")
-    store.write_plan(tmp_path / "plan", plan.tape, plan.robot, plan.summary)
-    return tmp_path / "plan"
+    return on_file(tmp_path / "plan")
 
 
 def measured(**changed) -> Metrics:
@@ -217,9 +215,7 @@ def test_what_makes_no_certificate_says_why(folder, physics, monkeypatch, capsys
 
 def test_a_new_plan_takes_the_certificate_away(folder, physics):
     certify(folder, 1, jobs=1)
-    plan = jump(0.6, 0.3, method="direct")
-    store.write_plan(folder, plan.tape, plan.robot, plan.summary)
-    assert held(folder) == LAID
+    assert held(on_file(folder)) == LAID
 
 
 def test_the_page_shows_every_quantity(folder, physics):

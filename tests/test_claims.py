@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump, planner
+from fixtures_core import jump, planner, refused
 from paper import capture, claims, hard_cases, worlds
 from paper.claims import CLAIMS, Start, against_crouch, compare_starts, judge, readings, readings_markdown
 from paper.tracking import followed_table, launch_followed, tracking
@@ -100,9 +100,7 @@ def test_each_limit_decides(name):
     ],
 )
 def test_a_verdict_without_numbers_is_refused(arguments, sentence):
-    with pytest.raises(InputError) as e:
-        judge(*arguments)
-    assert str(e.value).startswith(sentence)
+    assert refused(judge, *arguments).startswith(sentence)
 
 
 # ------------------------------------------------------------------------------------------ measurements
@@ -214,9 +212,7 @@ def test_readings_are_gathered_in_order(tmp_path):
     ],
 )
 def test_broken_tables_are_named(tmp_path, source, sentence):
-    with pytest.raises(InputError) as e:
-        readings([write(tmp_path / "00_a.ipynb", source)])
-    assert str(e.value).startswith(sentence)
+    assert refused(readings, [write(tmp_path / "00_a.ipynb", source)]).startswith(sentence)
 
 
 def test_unreadable_notebooks_are_named(tmp_path):

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import refused
 from paper.joint_qp_studies import CvxpySolver
 
 import jumplab as jl
@@ -298,6 +299,4 @@ REFUSED = [
 @pytest.mark.parametrize(("changes", "sentence"), REFUSED)
 def test_refused_in_a_sentence_before_any_solve(changes, sentence, monkeypatch):
     monkeypatch.setattr(JointMapper, "run", lambda *_: pytest.fail("solved"))
-    with pytest.raises(jl.errors.InputError) as e:
-        mapped(**changes)
-    assert str(e.value) == sentence
+    assert refused(mapped, **changes, by=jl.errors.InputError) == sentence

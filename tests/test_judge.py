@@ -42,6 +42,13 @@ def jumping() -> Clip:
     return Clip.of(jump(0.6, 0.3))
 
 
+@cache
+def landed(task, robot="bhr"):
+    """A plan and its simulation."""
+    plan = jl.plan(task, robot)
+    return plan, jl.simulate(plan)
+
+
 def moved(clip, **columns):
     q = clip.q.copy()
     for name, value in columns.items():
@@ -113,8 +120,7 @@ def test_motors_that_are_too_weak_for_a_plan_are_found_at_usual_rates_and_no_oth
 
 @pytest.mark.parametrize("fps", [30, 100])
 def test_what_stands_on_a_platform_is_judged_if_its_height_is_told(fps):
-    plan = jl.plan(jl.JumpTask(0.4, 0.3, platform_m=0.2))
-    run = jl.simulate(plan)
+    plan, run = landed(jl.JumpTask(0.4, 0.3, platform_m=0.2))
     assert jl.judge(plan, fps=fps).passed and jl.judge(run, fps=fps, platform_m=0.2).passed
     assert "standing feet float" in {c.name for c in jl.judge(run, fps=fps).failed}
 
@@ -131,7 +137,7 @@ def test_a_turn_on_the_spot_has_a_flight():
 @pytest.mark.parametrize("fps", [30, 100])
 def test_a_joint_leans_on_its_stop_which_takes_what_the_motor_cannot(fps):
     """As the waist of a G1 does when it has landed, with its motor spent."""
-    run = jl.simulate(jl.plan(jl.JumpTask(0.3, 0.2), "g1"))
+    _, run = landed(jl.JumpTask(0.3, 0.2), "g1")
     waist = run.joint_names.index("waist_pitch_joint")
     spent = np.abs(run.tau[:, waist]) > 0.99 * run.robot.limits.effort[waist]
     assert run.landed and spent.mean() > 0.03

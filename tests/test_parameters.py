@@ -1,6 +1,7 @@
 """Parameters that a notebook's first cells refuse, and those that they accept."""
 
 import pytest
+from fixtures_core import refused
 from paper import running
 
 from jumplab.cli import notebooks
@@ -26,9 +27,7 @@ n: int = 1  # 1 ... 9, how many"""
     ],
 )
 def test_check_parameters_refuses(injected, sentence):
-    with pytest.raises(InputError) as e:
-        running.check_parameters(opened(injected))
-    assert str(e.value).startswith(sentence)
+    assert refused(running.check_parameters, opened(injected)).startswith(sentence)
 
 
 def opened(injected, declared=DECLARED):

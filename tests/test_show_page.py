@@ -15,7 +15,7 @@ import matplotlib.image
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump
+from fixtures_core import jump, on_file, simulated
 from scipy.spatial import cKDTree
 from test_cli import one_sentence, run
 from test_store import names
@@ -30,7 +30,7 @@ from jumplab.robot_import.urdf import have_published, locate
 from jumplab.show import shapes
 from jumplab.show import viewer as viewer
 from jumplab.show.style import PHASE_COLORS
-from jumplab.sim import Scene, simulate_jump
+from jumplab.sim import Scene
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
@@ -45,8 +45,7 @@ browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machi
 
 @pytest.fixture(scope="module")
 def simulation():
-    p = jump(1.0, 0.5)
-    return simulate_jump(p.tape, p.robot)
+    return simulated(1.0, 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -258,9 +257,7 @@ def test_nothing_to_show(bhr):
 # the command ----------------------------------------------------------------------------------------------------
 @pytest.fixture
 def plan(tmp_path):
-    p = jump(1.0, 0.5)
-    store.write_plan(tmp_path / "plan", p.tape, p.robot, p.summary)
-    return tmp_path / "plan"
+    return on_file(tmp_path / "plan", jump(1.0, 0.5))
 
 
 def test_command(capsys, plan, odd_folder, simulation):

@@ -8,14 +8,13 @@ import io
 import matplotlib.image
 import numpy as np
 import pytest
-from fixtures_core import jump
+from fixtures_core import jump, simulated
 from test_show_page import CHROMIUM, FLAGS, STAGE, browser, count, published
 
 import jumplab as jl
 from jumplab.io.motion import Motion
 from jumplab.show import viewer as viewer
 from jumplab.show.viewer import FPS
-from jumplab.sim import simulate_jump
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[browser]'")
 pytestmark = [pytest.mark.slow, browser]
@@ -48,8 +47,7 @@ BASE = "() => { viewer.camera.updateMatrixWorld(); return upright(base(lead, now
 
 @pytest.fixture(scope="module")
 def simulation():
-    p = jump(1.0, 0.5)
-    return simulate_jump(p.tape, p.robot)
+    return simulated(1.0, 0.5)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixtures_core import jump
+from fixtures_core import jump, simulated
 from matplotlib.path import Path
 from matplotlib.text import Text
 from paper import diagrams, experiments, render
@@ -14,7 +14,7 @@ from scipy.ndimage import binary_dilation
 from jumplab import show as plotting
 from jumplab.robot.stance import stance_configuration
 from jumplab.show.style import MIN_FONT_PT, PHASE_COLORS
-from jumplab.sim import Scene, simulate_jump
+from jumplab.sim import Scene
 from jumplab.task import JumpTask
 
 TASK = JumpTask(1.0, 0.5)
@@ -26,8 +26,8 @@ def tape():
 
 
 @pytest.fixture(scope="module")
-def result(tape, bhr):
-    return simulate_jump(tape, bhr)
+def result():
+    return simulated(TASK.distance_m, TASK.height_m)
 
 
 def smallest_font(fig) -> float:

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump
+from fixtures_core import jump, refused
 from test_sim_world import Hold, momentum
 
 from jumplab import sim
@@ -98,9 +98,7 @@ def test_draws_stay_within_their_ranges(bhr):
     ],
 )
 def test_ranges_beyond_what_is_documented_are_refused(ranges, sentence):
-    with pytest.raises(InputError) as e:
-        Ranges(**ranges)
-    assert str(e.value) == sentence
+    assert refused(Ranges, **ranges) == sentence
 
 
 def test_disturbances_as_they_are_typed():
@@ -113,9 +111,7 @@ def test_disturbances_as_they_are_typed():
                          (["mass=0:1"], "the range mass must be one number, a half-width, got (0.0, 1.0)"),
                          (["mass"], "--disturb must be NAME=SIZE or NAME=FROM:TO, got 'mass'"),
                          (["mass=x"], "--disturb mass must be a number, got 'x'")):  # fmt: skip
-        with pytest.raises(InputError) as e:
-            ranges_of(disturbances("--disturb", pairs))
-        assert str(e.value).startswith(words)
+        assert refused(lambda pairs=pairs: ranges_of(disturbances("--disturb", pairs))).startswith(words)
 
 
 def test_a_payload_is_a_cube_fixed_to_the_trunk(engine, bhr):
@@ -224,9 +220,8 @@ def test_a_shove_is_timed_by_the_plan_and_known_to_the_checks(bhr):
     assert [p.step * STEP_S for p in found] == pytest.approx([x - 0.05 for x in (takeoff, end, end + 1)], abs=STEP_S)
     assert all(p.steps == 50 and p.force_n == pytest.approx((0, 300, 0)) for p in found)
     assert [Push(3, 2, (0.0, 0.0, 0.0)).at(k) for k in range(2, 6)] == [False, True, True, False]
-    with pytest.raises(InputError) as e:
-        Perturbation(shoves=shoves).pushes(None)
-    assert str(e.value) == "a shove, and other ground for the landing, are for a single jump; leave them out of a chain"
+    said = refused(Perturbation(shoves=shoves).pushes, None)
+    assert said == "a shove, and other ground for the landing, are for a single jump; leave them out of a chain"
 
 
 @pytest.mark.parametrize("name", INSTALLED)
@@ -257,9 +252,7 @@ def test_the_landing_is_moved_and_the_start_is_not(bhr):
     assert slope == pytest.approx(-np.tan(0.05), rel=1e-3)  # a positive pitch goes downhill
     assert (ground.top_at(end[0], 0.1) - ground.top_at(end[0])) / 0.1 == pytest.approx(-0.03, rel=0.01)
     short = replace(tape(), q=np.vstack([tape().q[:-1], tape().q[:1]]))
-    with pytest.raises(InputError) as e:
-        Perturbation(ground_m=0.03).ground(Scene.flat(), bhr, short)
-    assert str(e.value) == (
+    assert refused(Perturbation(ground_m=0.03).ground, Scene.flat(), bhr, short) == (
         "the soles land 0.00 m from where they start, so ground_* would also change the ground of the start; "
         "jump farther, or leave out ground_*"
     )
@@ -309,9 +302,8 @@ def test_boxes_lie_where_the_heights_are():
     ],
 )  # fmt: skip
 def test_a_scene_that_the_robot_cannot_stand_on_is_refused(bhr, scene, sentence):
-    with pytest.raises(InputError) as e:
-        sim.simulate_jump(tape(), bhr, scene=scene)
-    assert str(e.value).startswith(f"scene {scene.name}: the robot cannot stand on it at the start, {sentence}")
+    said = refused(sim.simulate_jump, tape(), bhr, scene=scene)
+    assert said.startswith(f"scene {scene.name}: the robot cannot stand on it at the start, {sentence}")
 
 
 @pytest.fixture(scope="module")

@@ -38,11 +38,6 @@ DISTANCE, HEIGHT = 0.6, 0.3
 SHORT_S = 0.3  # enough to compare launches and flights
 
 
-@pytest.fixture(scope="module")
-def tape(bhr):
-    return fixtures_core.jump(DISTANCE, HEIGHT, method="direct").tape
-
-
 @pytest.fixture(scope="module", params=[("position", INSTALLED[0]), ("pd", INSTALLED[-1])])
 def jump(request, bhr, tape):
     mode, engine = request.param
@@ -423,11 +418,3 @@ def test_toes_at_touchdown_are_those_of_the_feet_that_are_to_land(bhr, tape):
 def test_bad_options(bhr, tape, options, words):
     with pytest.raises(InputError, match=words):
         simulate(tape, bhr, **options)
-
-
-def test_a_tape_of_another_robot(bhr, tape):
-    other = Robot.from_text(
-        bhr.urdf.replace("left_knee", "left_knie"), bhr.config_text.replace("left_knee", "left_knie")
-    )
-    with pytest.raises(InputError, match="are not those of robot bhr"):
-        simulate(tape, other)

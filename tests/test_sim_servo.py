@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump
 
 from jumplab.control import servo as law
 from jumplab.control.body import WholeBody
@@ -23,11 +22,6 @@ from jumplab.sim.motors import Motors
 G1 = pytest.param(
     "g1_arms", marks=pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 )
-
-
-@pytest.fixture(scope="module")
-def tape(bhr):
-    return jump(0.6, 0.3, method="direct").tape
 
 
 def told(robot, posture, **changed) -> Command:

@@ -5,6 +5,7 @@ from itertools import pairwise, product
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import refused
 from fixtures_robots import canted, config, joint, one_axis_ankle, root, text, write
 from scipy.optimize import linprog
 
@@ -204,9 +205,7 @@ def test_feet_tell_where_a_robot_faces_whose_knees_turn_both_ways(tmp_path):
 
 
 def test_what_needs_five_links_is_refused(robot):
-    with pytest.raises(InputError) as e:
-        run_chain(Course.of([0.3, 0.3], 0.3), robot)
-    assert str(e.value) == (
+    assert refused(run_chain, Course.of([0.3, 0.3], 0.3), robot) == (
         "robot wide: a chain needs a planar model of five links, in whose crouch the robot waits; choose a robot that "
         "has one"
     )
