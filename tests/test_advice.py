@@ -40,9 +40,7 @@ class Fake:
 
 
 def error_of(task, monkeypatch, planner):
-    monkeypatch.setattr(
-        advice, "refused", lambda p, t, m: SolverError("no") if m == "direct" else raised(p.plan, t, m)
-    )
+    monkeypatch.setattr(advice, "refused", lambda p, t, m: SolverError("no") if m == "direct" else raised(p.plan, t, m))
     with pytest.raises(JumplabError) as e:
         advice.plan_or_advise(planner, task)
     return e.value

@@ -64,18 +64,12 @@ REFUSALS = [
     ("plan --out x --height-m -0.5", "height = -0.5 m is outside 0.02 ... 1.5 m"),
     ("plan --out x --platform-m 5", "platform = 5 m is outside -1 ... 1 m"),
     ("plan --out x --rotation-deg 1e400", "rotation must be finite, got inf"),
-    (
-        "plan --out x --rotation-deg 350",
-        "rotation = 350 deg: the robot lands on its feet only after a multiple of 360 deg; nearest is 360 deg",
-    ),
-    (
-        "plan --out x --method magic",
-        "argument --method: invalid choice: 'magic' (choose from 'usual', 'three-step', 'direct'); " + HELP_PLAN,
-    ),
-    (
-        "plan --out x --robot asimo",
-        f"robot 'asimo': neither a shipped robot ({', '.join(SHIPPED)}) nor a readable TOML file",
-    ),
+    ("plan --out x --rotation-deg 350",
+     "rotation = 350 deg: the robot lands on its feet only after a multiple of 360 deg; nearest is 360 deg"),
+    ("plan --out x --method magic",
+     "argument --method: invalid choice: 'magic' (choose from 'usual', 'three-step', 'direct'); " + HELP_PLAN),
+    ("plan --out x --robot asimo",
+     f"robot 'asimo': neither a shipped robot ({', '.join(SHIPPED)}) nor a readable TOML file"),
     ("plan --out=", "--out must name a folder, got ''"),
     ("plan --out /dev/null/x", "the folder '/dev/null/x' cannot be written (Not a directory); choose another one"),
     ("simulate", "the following arguments are required: DIR; 'jumplab simulate --help' shows what is possible"),
@@ -91,7 +85,7 @@ REFUSALS = [
     ("run -p height_m=1", "--parameter height_m is given twice, or has an option of its own; set it once"),
     ("run -p out=1", "the runner sets the notebook parameter 'out' itself; pass the folder as its argument out"),
     ("run --out /dev/null/x", "the folder '/dev/null/x' cannot be written (Not a directory); choose another one"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("command", "sentence"), REFUSALS, ids=[c for c, _ in REFUSALS])
@@ -182,14 +176,11 @@ def test_plan_that_fails_its_audit(capsys, here, planner):
     [
         (InfeasibleError("too high\n for this robot"), 3, "too high for this robot"),
         (SolverError("stage 1 stopped", stage="SRMP launch"), 3, "stage 1 stopped"),
-        (
-            ZeroDivisionError("x\ny"),
-            4,
-            "internal failure, ZeroDivisionError: x; run it again with --debug for the traceback",
-        ),
+        (ZeroDivisionError("x\ny"), 4,
+         "internal failure, ZeroDivisionError: x; run it again with --debug for the traceback"),
         (KeyboardInterrupt(), 130, "interrupted; what was there before is unchanged"),
     ],
-)
+)  # fmt: skip
 def test_failed_plan(capsys, here, planner, error, code, sentence):
     planner.error = error
     assert one_sentence(*run(capsys, "plan", "--out", "p"), expected_code=code) == sentence
@@ -205,21 +196,15 @@ def test_debug_shows_the_traceback(capsys, here, planner):
         assert err.endswith("\njumplab: internal failure, ZeroDivisionError: x\n")
 
 
-@pytest.mark.parametrize(
-    ("metrics", "lines"),
-    [
-        (
-            METRICS,
-            "simulated: distance 1.002 m, rise 0.497 m\nlanding: stands, 3.40 s on its feet after touchdown (stood)\n"
-            "checks: all 1 of the run passed\n",
-        ),
-        (
-            FALL,
-            "simulated: distance none, rise none\nlanding: FAILED, 0.00 s on its feet after touchdown (fell)\n"
-            "CHECK FAILED: mass 43 kg, at most 42.5: another robot\n",
-        ),
-    ],
-)
+SIMULATED = [
+    (METRICS, "simulated: distance 1.002 m, rise 0.497 m\nlanding: stands, 3.40 s on its feet after touchdown (stood)\n"
+              "checks: all 1 of the run passed\n"),
+    (FALL, "simulated: distance none, rise none\nlanding: FAILED, 0.00 s on its feet after touchdown (fell)\n"
+           "CHECK FAILED: mass 43 kg, at most 42.5: another robot\n"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("metrics", "lines"), SIMULATED)
 def test_simulate(capsys, bhr, tmp_path, monkeypatch, metrics, lines):
     class Simulated(Result):
         def to_json(self):

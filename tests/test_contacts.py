@@ -158,14 +158,9 @@ def test_phases_share_what_does_not_jump(bhr):
     levels = "in place", "still", "held"
     stood, landed, joined = (1, 1, 0), (0, 0, 0), (1, 1, 1)
     for k, side, expected in (
-        (1, "left", joined),
-        (2, "left", stood),
-        (2, "right", landed),
-        (3, "right", joined),
-        (6, "left", landed),
-        (7, "left", stood),
-        (7, "right", landed),
-    ):
+        (1, "left", joined), (2, "left", stood), (2, "right", landed), (3, "right", joined), (6, "left", landed),
+        (7, "left", stood), (7, "right", landed),
+    ):  # fmt: skip
         assert tuple(skips[k][f"{side} foot {level}"] for level in levels) == expected, (k, side)
     assert [x["base forces"] for x in skips] == [0, 1, 0, 1, 1, 1, 0, 0]
 
@@ -233,62 +228,44 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
     return (ContactPhase("LR", (low, high), 0.5),)
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: Contacts(()), "a contact schedule needs at least one phase"),
-        (lambda: Contacts(("LR",)), "an entry of phases must be a ContactPhase, got 'LR'"),
-        (lambda: schedule("LR RL"), f"phase '2 RL': feet = 'RL'; {WRITE}"),
-        (lambda: schedule("LR both"), f"phase '2 both': feet = 'both'; {WRITE}"),
-        (lambda: Contacts((ContactPhase(3, (0.2, 0.5), 0.3),)), f"phase '1 3': feet = 3; {WRITE}"),
-        (
-            lambda: Contacts((ContactPhase("LR", (0.2,), 0.3),)),
-            "phase '1 LR': time_s must be (low, high) and guess_s a number, both in seconds",
-        ),
-        (
-            lambda: Contacts((ContactPhase("LR", (0.2, 0.5), float("nan")),)),
-            "phase '1 LR': time_s must be (low, high) and guess_s a number, both in seconds",
-        ),
-        (lambda: Contacts.hop(Robot.load(), foot="both"), "foot = 'both': choose left or right"),
-        (lambda: Contacts(long(0.5, 0.3)), "phase '1 LR': its time of 0.5 to 0.3 s must be positive, and in order"),
-        (lambda: Contacts(long(0.0, 0.3)), "phase '1 LR': its time of 0 to 0.3 s must be positive, and in order"),
-        (lambda: Contacts(long(0.1, np.inf)), "phase '1 LR': its time of 0.1 to inf s must be positive, and in order"),
-        (
-            lambda: Contacts(phases("LR", intervals=1)),
-            "phase '1 LR': intervals = 1 must be a whole number of 2 or more",
-        ),
-        (
-            lambda: Contacts(phases("LR", intervals=2.5)),
-            "phase '1 LR': intervals = 2.5 must be a whole number of 2 or more",
-        ),
-        (
-            lambda: schedule("LR L L LR", 1),
-            "phase '3 L': the same feet are on the ground as in the phase before; make one phase of them",
-        ),
-        (lambda: schedule("lr - LR", 2), f"phase '1 lr': {WAIT}"),
-        (lambda: schedule("Lr - LR", 2), f"phase '1 Lr': {WAIT}"),
-        (lambda: schedule("- LR", 2), f"phase '1 -': {WAIT}"),
-        (lambda: Contacts(phases("LR L", name="go")), "two phases are called 'go'; names must be unique in a schedule"),
-        (lambda: schedule("LR -", ends="flight"), "ends = 'flight': choose 'rest' or 'touchdown'"),
-        (lambda: schedule("LR -"), "phase '2 -': a schedule that ends with 'rest' has to end on the ground"),
-        (
-            lambda: schedule("LR - LR", 2, ends="touchdown"),
-            "phase '3 LR': a schedule that ends with 'touchdown' has to end in flight",
-        ),
-        (lambda: schedule("L LR", 1), f"phase '1 L': {ALONE} right one; begin with 'LR'"),
-        (lambda: schedule("R - R", 1), f"phase '1 R': {ALONE} left one; begin with 'LR'"),
-        (lambda: schedule("LR lr - LR", 1), f"places: 1 given, but {CAME}; {AFTER}"),
-        (lambda: schedule("LR lr LR", 2), f"places: 2 given, but feet come down 0 times (none); {AFTER}"),
-        (
-            lambda: stairs("LR - LR", 0.2, 0.3),
-            f"phase '3 LR': the left foot comes down 0.2 m high, in places at the heights 0.2, 0.3 m; {STEP}",
-        ),
-        (
-            lambda: stairs("LR - LR - LR", 0.2, 0.2, 0.0, 0.0),
-            f"phase '3 LR': the left foot comes down 0.2 m high, in places at the heights 0.2, 0.2, 0, 0 m; {STEP}",
-        ),
-    ],
-)
+BOTH = "phase '1 LR': time_s must be (low, high) and guess_s a number, both in seconds"
+TIME = "phase '1 LR': its time of {} s must be positive, and in order"
+WHOLE = "phase '1 LR': intervals = {} must be a whole number of 2 or more"
+HIGH = "phase '3 LR': the left foot comes down 0.2 m high, in places at the heights {} m; "
+REFUSED = [
+    (lambda: Contacts(()), "a contact schedule needs at least one phase"),
+    (lambda: Contacts(("LR",)), "an entry of phases must be a ContactPhase, got 'LR'"),
+    (lambda: schedule("LR RL"), f"phase '2 RL': feet = 'RL'; {WRITE}"),
+    (lambda: schedule("LR both"), f"phase '2 both': feet = 'both'; {WRITE}"),
+    (lambda: Contacts((ContactPhase(3, (0.2, 0.5), 0.3),)), f"phase '1 3': feet = 3; {WRITE}"),
+    (lambda: Contacts((ContactPhase("LR", (0.2,), 0.3),)), BOTH),
+    (lambda: Contacts((ContactPhase("LR", (0.2, 0.5), float("nan")),)), BOTH),
+    (lambda: Contacts.hop(Robot.load(), foot="both"), "foot = 'both': choose left or right"),
+    (lambda: Contacts(long(0.5, 0.3)), TIME.format("0.5 to 0.3")),
+    (lambda: Contacts(long(0.0, 0.3)), TIME.format("0 to 0.3")),
+    (lambda: Contacts(long(0.1, np.inf)), TIME.format("0.1 to inf")),
+    (lambda: Contacts(phases("LR", intervals=1)), WHOLE.format(1)),
+    (lambda: Contacts(phases("LR", intervals=2.5)), WHOLE.format(2.5)),
+    (lambda: schedule("LR L L LR", 1),
+     "phase '3 L': the same feet are on the ground as in the phase before; make one phase of them"),
+    (lambda: schedule("lr - LR", 2), f"phase '1 lr': {WAIT}"),
+    (lambda: schedule("Lr - LR", 2), f"phase '1 Lr': {WAIT}"),
+    (lambda: schedule("- LR", 2), f"phase '1 -': {WAIT}"),
+    (lambda: Contacts(phases("LR L", name="go")), "two phases are called 'go'; names must be unique in a schedule"),
+    (lambda: schedule("LR -", ends="flight"), "ends = 'flight': choose 'rest' or 'touchdown'"),
+    (lambda: schedule("LR -"), "phase '2 -': a schedule that ends with 'rest' has to end on the ground"),
+    (lambda: schedule("LR - LR", 2, ends="touchdown"),
+     "phase '3 LR': a schedule that ends with 'touchdown' has to end in flight"),
+    (lambda: schedule("L LR", 1), f"phase '1 L': {ALONE} right one; begin with 'LR'"),
+    (lambda: schedule("R - R", 1), f"phase '1 R': {ALONE} left one; begin with 'LR'"),
+    (lambda: schedule("LR lr - LR", 1), f"places: 1 given, but {CAME}; {AFTER}"),
+    (lambda: schedule("LR lr LR", 2), f"places: 2 given, but feet come down 0 times (none); {AFTER}"),
+    (lambda: stairs("LR - LR", 0.2, 0.3), HIGH.format("0.2, 0.3") + STEP),
+    (lambda: stairs("LR - LR - LR", 0.2, 0.2, 0.0, 0.0), HIGH.format("0.2, 0.2, 0, 0") + STEP),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "sentence"), REFUSED)
 def test_refused(make, sentence):
     assert refused(make) == sentence
 

@@ -225,9 +225,7 @@ def test_between_samples():
     assert motion.at([0.5205 + 0.9e-9]).tau[0] == pytest.approx(motion.tau[-1])
     for outside in ([0.4999, 0.51], [0.51, 0.5205 + 2e-9]):
         first, last = (f"{x:g}" for x in outside)
-        assert refused(motion.at, outside) == (
-            f"times {first} ... {last} s are outside the motion, 0.5 ... 0.5205 s"
-        )
+        assert refused(motion.at, outside) == (f"times {first} ... {last} s are outside the motion, 0.5 ... 0.5205 s")
 
 
 def test_the_end_may_stand_twice():
@@ -249,9 +247,7 @@ def test_grids():
     for rate in (np.nan, np.inf):
         assert refused(motion.every, rate) == f"rate_hz must be finite, got {rate:g}"
     for rate in (0.0, -1.0, 10_000.1):
-        assert refused(motion.every, rate) == (
-            f"rate = {rate:g} per second must lie above 0 and not above 10000"
-        )
+        assert refused(motion.every, rate) == (f"rate = {rate:g} per second must lie above 0 and not above 10000")
 
 
 def test_signs_of_quaternions():

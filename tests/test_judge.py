@@ -218,10 +218,7 @@ WRONG = {
     "few": (dict(root_trans_offset=Q[:3, :3], root_rot=Q[:3, 3:7], dof=Q[:3, 7:]), "has 3 frames; a motion has 10"),
     "count": (dict(dof=Q[:, 7:-1]), "clips of robot bhr have 14: pass the robot that the clip was made for"),
     "lengths": (dict(dof=Q[:5, 7:]), r"must be \(n, 3\), \(n, 4\), \(n, joints\)"),
-    "order": (
-        dict(dof=2.9 + 0 * Q[:, 7:]),
-        "most of the time: its joints are in another order, or the clip is",
-    ),
+    "order": (dict(dof=2.9 + 0 * Q[:, 7:]), "most of the time: its joints are in another order, or the clip is"),
     "length": (dict(root_rot=2 * Q[:, 3:7]), "the quaternion of frame 0 has length 2, must be 1; normalise it"),
     "a list": (dict(dof=[None] * len(Q)), r"its arrays do not fit each other \(joints: no real numbers\)"),
     "complex": (dict(dof=Q[:, 7:] + 0j), r"its arrays do not fit each other \(joints: no real numbers\)"),

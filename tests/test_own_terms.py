@@ -61,12 +61,9 @@ def refuses(sentence: str, call, *arguments, **how) -> None:
 
 
 # problems -------------------------------------------------------------------------------------------------------
-def test_nothing_asked_nothing_changed():
-    problem = toy()
-    assert changed(problem) is problem
-
-
 def test_a_weight_of_zero_is_no_term():
+    usual = toy()
+    assert changed(usual) is usual
     problem = changed(toy(), {"two": [cost(lambda p: p.q, weight=0.0)]})
     assert problem == changed(problem) and [t.name for _, t in problem.terms()] == [t.name for _, t in toy().terms()]
     assert not problem.own
@@ -78,59 +75,34 @@ def test_terms_weights_and_switches_of_a_problem():
     assert terms["two", "x"].weight == 3.0 and terms["one", "node cost"].weight == 7.0
     assert ("one", "end row") not in terms and set(problem.own) == {("two", "x")}
     assert len(problem.terms()) == len(toy().terms())
-
-
-def test_a_problem_without_a_bound():
     assert [b.name for _, b in changed(toy(), off=["rest"]).bounds()] == []
 
 
-@pytest.mark.parametrize(
-    ("term", "sentence"),
-    [
-        (cost(lambda p: p.q, "jerk"), "term 'jerk' of 'toy/two': another term has this name; choose another one"),
-        (
-            cost(lambda p: p.q, "jerk chain"),
-            "term 'jerk chain' of 'toy/two': another term has this name; choose another one",
-        ),
-        (cost(lambda p: p.q, "a/b"), "term 'a/b' of 'toy/two': a name must not hold a '/'"),
-        (
-            cost(lambda p: p.q, at="problem"),
-            "term 'x' of 'toy/two': at = 'problem' joins phases; add the term to 'toy' instead",
-        ),
-        (cost(lambda p: p.q, weight=-1.0), "weight 'x' = -1.0: it must be a number of 0 or more"),
-        (cost(lambda p: p.q, weight=float("nan")), "weight 'x' = nan: it must be a number of 0 or more"),
-        (
-            cost(lambda p: 1 / 0),
-            "term 'x' of 'toy/two': its expression cannot be evaluated (ZeroDivisionError: division by zero)",
-        ),
-        (
-            cost(lambda p: p.joints),
-            "term 'x' of 'toy/two': its expression cannot be evaluated (AttributeError: a point has no 'joints')",
-        ),
-        (
-            cost(lambda p: ca.horzcat(p.q, p.q)),
-            "term 'x' of 'toy/two': its expression has the shape (1, 2); it must return a column of one row or more",
-        ),
-        (
-            cost(lambda p: []),
-            "term 'x' of 'toy/two': its expression has the shape (0, 1); it must return a column of one row or more",
-        ),
-        (
-            cost(lambda p: ca.SX.sym("stray") * p.q),
-            "term 'x' of 'toy/two': it uses symbols from outside its point (stray); use only those of its point",
-        ),
-        (
-            cost(lambda p: p.q, weight=None, lower=[1.0, 2.0, 3.0], upper=9.0),
-            "term 'x' of 'toy/two': lower = [1.0, 2.0, 3.0] does not fit its expression, which has 1 row; give one "
-            "number, or one per row",
-        ),
-        (
-            cost(lambda p: p.q, weight=None, lower=2.0, upper=1.0),
-            "term 'x' of 'toy/two': lower = 2.0 is above upper = 1.0",
-        ),
-        (cost(lambda p: p.q, weight=None, upper="high"), "term 'x' of 'toy/two': upper = 'high' is not a number"),
-    ],
-)
+TWO = "term 'x' of 'toy/two': "
+TAKEN = "term '{}' of 'toy/two': another term has this name; choose another one"
+SHAPE = TWO + "its expression has the shape {}; it must return a column of one row or more"
+FAILS = TWO + "its expression cannot be evaluated ({})"
+REFUSED = [
+    (cost(lambda p: p.q, "jerk"), TAKEN.format("jerk")),
+    (cost(lambda p: p.q, "jerk chain"), TAKEN.format("jerk chain")),
+    (cost(lambda p: p.q, "a/b"), "term 'a/b' of 'toy/two': a name must not hold a '/'"),
+    (cost(lambda p: p.q, at="problem"), f"{TWO}at = 'problem' joins phases; add the term to 'toy' instead"),
+    (cost(lambda p: p.q, weight=-1.0), "weight 'x' = -1.0: it must be a number of 0 or more"),
+    (cost(lambda p: p.q, weight=float("nan")), "weight 'x' = nan: it must be a number of 0 or more"),
+    (cost(lambda p: 1 / 0), FAILS.format("ZeroDivisionError: division by zero")),
+    (cost(lambda p: p.joints), FAILS.format("AttributeError: a point has no 'joints'")),
+    (cost(lambda p: ca.horzcat(p.q, p.q)), SHAPE.format("(1, 2)")),
+    (cost(lambda p: []), SHAPE.format("(0, 1)")),
+    (cost(lambda p: ca.SX.sym("stray") * p.q),
+     f"{TWO}it uses symbols from outside its point (stray); use only those of its point"),
+    (cost(lambda p: p.q, weight=None, lower=[1.0, 2.0, 3.0], upper=9.0),
+     f"{TWO}lower = [1.0, 2.0, 3.0] does not fit its expression, which has 1 row; give one number, or one per row"),
+    (cost(lambda p: p.q, weight=None, lower=2.0, upper=1.0), f"{TWO}lower = 2.0 is above upper = 1.0"),
+    (cost(lambda p: p.q, weight=None, upper="high"), f"{TWO}upper = 'high' is not a number"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("term", "sentence"), REFUSED)
 def test_own_terms_that_are_refused(term, sentence):
     refuses(sentence, changed, toy(), {"two": [term]})
 
@@ -235,19 +207,11 @@ def test_names_of_stages_that_are_refused(bhr):
 def test_settings_that_are_refused(bhr):
     with pytest.raises(InputError, match=r"^Limits has no 'torque'; it has torque_share, .* and \d+ more$"):
         jl.Planner(bhr, limits={"torque": 1.0})
-    refuses(
-        "Limits: friction = 'ice' must be of the same kind as its default, 0.42",
-        jl.Planner,
-        bhr,
-        limits={"friction": "ice"},
-    )
+    said = "Limits: friction = 'ice' must be of the same kind as its default, 0.42"
+    refuses(said, jl.Planner, bhr, limits={"friction": "ice"})
     refuses("give a Limits or a mapping of its fields, got 3", jl.Planner, bhr, limits=3)
-    refuses(
-        "SrmpSettings: toe_s = 0.1 must be of the same kind as its default, (0.12, 0.12)",
-        jl.Planner,
-        bhr,
-        settings={"toe_s": 0.1},
-    )
+    said = "SrmpSettings: toe_s = 0.1 must be of the same kind as its default, (0.12, 0.12)"
+    refuses(said, jl.Planner, bhr, settings={"toe_s": 0.1})
     refuses("mesh: toe = 1 intervals, must be a whole number of 2 or more", jl.Planner, bhr, mesh={"toe": 1})
 
 

@@ -129,11 +129,7 @@ def test_figure_can_be_read_in_print(figure):
 def test_colours_are_okabe_and_ito():
     palette = {to_hex(c).upper() for c in matplotlib.color_sequences["okabe_ito"]}
     assert {plotting.LAUNCH, plotting.FLIGHT, plotting.LANDING, plotting.VERMILION, plotting.SKY} <= palette
-    assert plotting.PHASE_COLORS == {
-        "launch": plotting.LAUNCH,
-        "flight": plotting.FLIGHT,
-        "landing": plotting.LANDING,
-    }
+    assert plotting.PHASE_COLORS == {"launch": plotting.LAUNCH, "flight": plotting.FLIGHT, "landing": plotting.LANDING}
     used = {c.upper().lstrip("#") for c in re.findall(r"'([0-9A-Fa-f]{6})'", style.STYLE_FILE.read_text())}
     assert {f"#{c}" for c in used} <= palette
 

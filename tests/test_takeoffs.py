@@ -17,6 +17,8 @@ from jumplab.stages.whole_body.contacts import LONGER, STEP_SHARE
 from jumplab.studies import advice
 
 FLIGHT_S = (0.1, 1.0)
+STANDING = "{0}: only a jump from a stand, off both feet and onto both, turns; leave out takeoff, landing and run_up, "
+STANDING += "or the {0}"
 OFF_THE_LEFT = jl.JumpTask(0.25, 0.06, takeoff="left")
 
 
@@ -36,16 +38,8 @@ def hop() -> jl.JumpPlan:
         ({"run_up": 40}, "run_up = 40 must be a whole number of steps, 0 to 30"),
         ({"run_up": 1.5}, "run_up = 1.5 must be a whole number of steps, 0 to 30"),
         ({"run_up": True}, "run_up must be a number, got True"),
-        (
-            {"takeoff": "left", "yaw_rad": 1.0},
-            "yaw: only a jump from a stand, off both feet and onto both, turns; leave out takeoff, landing and run_up, "
-            "or the yaw",
-        ),
-        (
-            {"run_up": 1, "rotation_rad": 6.283185307},
-            "rotation: only a jump from a stand, off both feet and onto both, turns; leave out takeoff, landing and "
-            "run_up, or the rotation",
-        ),
+        ({"takeoff": "left", "yaw_rad": 1.0}, STANDING.format("yaw")),
+        ({"run_up": 1, "rotation_rad": 6.283185307}, STANDING.format("rotation")),
         (
             {"run_up": 2, "distance_m": -0.2},
             "run_up = 2 with a distance of -0.2 m: a run-up goes ahead, so the distance must be 0 or more",

@@ -1,6 +1,5 @@
 """Jumps out of the plane: the method that plans them, the one that is refused, their pictures."""
 
-
 import numpy as np
 import pytest
 from fixtures_core import jump, planner, refused

@@ -27,18 +27,9 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.stages.whole_body.settings import Weights
 
 G, MASS = 9.8, 42.0
-BROKEN = {
-    "heel up and a moment about the toe",
-    "moment about the toe, heel up",
-    "CoP outside the sole",
-    "c_z'' at take-off, off -g",
-    "force residual, launch",
-    "force residual, flight",
-    "drift of L in flight",
-    "jump length error",
-    "sole off the surface at touchdown",
-    "foot pitch at touchdown",
-}
+BROKEN = {"heel up and a moment about the toe", "moment about the toe, heel up", "CoP outside the sole",
+          "c_z'' at take-off, off -g", "force residual, launch", "force residual, flight", "drift of L in flight",
+          "jump length error", "sole off the surface at touchdown", "foot pitch at touchdown"}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
