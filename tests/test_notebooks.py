@@ -197,8 +197,7 @@ def test_read_only_checkout_sends_everything_to_out(tmp_path, monkeypatch):
     report = running.run_notebooks(notebooks=chain, out=out, progress=False)
     assert report.figures == out / "figures"
     assert names(out) == ["figures", "notebooks", "seen_0.json"] and names(checkout) == ["notebooks"]
-    with pytest.raises(InputError, match="read-only"):
-        running.run_notebooks(notebooks=chain, progress=False)
+    assert "read-only" in refused(running.run_notebooks, notebooks=chain, progress=False)
 
 
 def test_a_second_chain_in_one_folder_is_refused(tmp_path):
@@ -221,8 +220,7 @@ def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
     path = tmp_path / "notebooks" / "00_x.ipynb"
     path.parent.mkdir()
     path.write_text("{")
-    with pytest.raises(InputError, match=r"00_x\.ipynb: not a readable notebook"):
-        running.run_notebooks(notebooks=[path], progress=False)
+    assert "00_x.ipynb: not a readable notebook" in refused(running.run_notebooks, notebooks=[path], progress=False)
     path.unlink()
     monkeypatch.setattr(notebooks, "PLACES", [tmp_path / "notebooks", tmp_path / "jumplab" / "notebooks"])
     monkeypatch.chdir(tmp_path)

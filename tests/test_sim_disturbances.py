@@ -14,7 +14,6 @@ from test_sim_world import Hold, momentum
 from jumplab import sim
 from jumplab.cli.common import disturbances
 from jumplab.control.kinematics import Gauge
-from jumplab.errors import InputError
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import (
     CONTACTS,
@@ -49,8 +48,7 @@ def tape():
 
 
 def test_a_negative_seed_is_refused(bhr):
-    with pytest.raises(InputError, match=r"^seed = -3 must not be negative$"):
-        Perturbation.draw(bhr, -3)
+    assert refused(Perturbation.draw, bhr, -3) == "seed = -3 must not be negative"
 
 
 def test_the_robots_of_the_usual_ranges_stay_the_same(bhr):

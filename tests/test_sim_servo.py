@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import refused
 
 from jumplab.control import servo as law
 from jumplab.control.body import WholeBody
@@ -251,8 +252,7 @@ def test_states_that_are_no_robot_s_are_refused_in_a_sentence(bhr, tape):
             control.torque(0.5, State(*(state | {name: broken}).values()))
         with pytest.raises(InputError, match=rf"^the state's {name} must have the shape \("):
             control.torque(0.5, State(*(state | {name: array[:-1]}).values()))
-    with pytest.raises(InputError, match=r"^t must be finite"):
-        control.torque(np.nan, State(*state.values()))
+    assert refused(control.torque, np.nan, State(*state.values())).startswith("t must be finite")
     renamed = tape.joint_names[::-1]
     first = str(renamed[0])
     with pytest.raises(InputError, match=rf"^the tape's joints {first}, .* are not those of robot bhr; plan the jump"):

@@ -25,15 +25,9 @@ def body(com=(0.0, 0.0, 0.8), velocity=(0.0, 0.0, 0.0), turned_rad=0.0):
     c, s = np.cos(turned_rad), np.sin(turned_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     soles = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]) @ turn.T
-    return SimpleNamespace(
-        com=turn @ com,
-        com_velocity=turn @ velocity,
-        soles=soles,
-        attitudes=np.array([turn, turn]),
-        twists=np.zeros((2, 6)),
-        gravity=np.array([0.0, 0.0, -9.8]),
-        size=Size(1.0, 1.0),
-    )
+    still = dict(twists=np.zeros((2, 6)), gravity=np.array([0.0, 0.0, -9.8]), size=Size(1.0, 1.0))
+    attitudes = np.array([turn, turn])
+    return SimpleNamespace(com=turn @ com, com_velocity=turn @ velocity, soles=soles, attitudes=attitudes, **still)
 
 
 def test_distance_from_a_hull():

@@ -95,8 +95,7 @@ def single_array() -> bytes:
 @pytest.mark.parametrize("text", [b"", b"hello", b"\x93NUMPY\x01\x00garbage", single_array()])
 def test_not_an_archive(tmp_path, text):
     (tmp_path / "plan.npz").write_bytes(text)
-    with pytest.raises(InputError, match="not a readable plan"):
-        Tape.load(tmp_path / "plan.npz")
+    assert "not a readable plan" in refused(Tape.load, tmp_path / "plan.npz")
 
 
 SCHEMAS = f"schema {{!r}}, this version reads {SCHEMA!r}; plan the jump again"

@@ -22,13 +22,8 @@ from jumplab.stages.whole_body.starts import GIVEN, IN_PLANE
 from jumplab.task import JumpTask
 
 LIMITS, MG = Limits(), 42.0 * 9.8
-JUMPS = [
-    (1.0, 0.5, 0.0, "three-step"),
-    (0.6, 0.5, 0.3, "three-step"),
-    (0.8, 0.3, -0.2, "three-step"),
-    (1.0, 0.5, 0.0, "direct"),
-    (0.6, 0.5, 0.3, "direct"),
-]
+JUMPS = [(1.0, 0.5, 0.0, "three-step"), (0.6, 0.5, 0.3, "three-step"), (0.8, 0.3, -0.2, "three-step"),
+         (1.0, 0.5, 0.0, "direct"), (0.6, 0.5, 0.3, "direct")]  # fmt: skip
 
 
 @pytest.fixture(params=JUMPS, ids=str, scope="module")
