@@ -115,16 +115,13 @@ def test_bounds_grow_with_what_they_are_made_of(body):
 @pytest.mark.parametrize(
     ("task", "number", "sentence"),
     [
-        (
-            jl.JumpTask(3.0, 0.02),
-            "distance_m",
-            r"a travel of 3 m with a rise of 0.02 m is impossible for robot bhr: .* 2.95 m",
-        ),
+        (jl.JumpTask(3.0, 0.02), "distance_m",
+         r"a travel of 3 m with a rise of 0.02 m is impossible for robot bhr: .* 2.95 m"),
         (jl.JumpTask(-3.0, 0.02), "distance_m", "a travel of 3 m with a rise of 0.02 m is impossible"),
         (jl.JumpTask(0.0, 0.02, side_m=3.0), "side_m", "a travel of 3 m"),
         (jl.JumpTask(1.0, 0.05, platform_m=1.0), "platform_m", "a platform of 1 m with a rise of 0.05 m is impossible"),
     ],
-)
+)  # fmt: skip
 def test_what_is_beyond_a_bound_is_refused_before_anything_is_solved(task, number, sentence, monkeypatch):
     monkeypatch.setattr(WholeBodyPlanner, "plan", None)
     with pytest.raises(InfeasibleError, match=sentence) as e:

@@ -42,12 +42,10 @@ def test_course_of_numbers():
         (([0.6, 0.6], 0.3, [0.8, -0.8]), "jump 2 of 2: platform = -1.6 m is outside -1 ... 1 m"),
         (([0.5, 0.5], 0.3, None, [0.1]), "1 sides for 2 distances: give one per jump"),
         (([0.5, 0.5], 0.3, None, None, [1.0] * 3), "3 turns for 2 distances: give one per jump"),
-        (
-            ([0.5, 0.5], 0.3, [0.1, 0.1], None, [1.0, 0.0]),
-            "platforms need a straight course; leave out the platforms, or the sides and turns",
-        ),
+        (([0.5, 0.5], 0.3, [0.1, 0.1], None, [1.0, 0.0]),
+         "platforms need a straight course; leave out the platforms, or the sides and turns"),
     ],
-)
+)  # fmt: skip
 def test_courses_that_cannot_be_meant(arguments, sentence):
     assert refused(Course.of, *arguments) == sentence
 
@@ -55,16 +53,12 @@ def test_courses_that_cannot_be_meant(arguments, sentence):
 @pytest.mark.parametrize(
     ("arguments", "kind", "sentence"),
     [
-        (
-            ([0.6, 0.25], 0.3, [0.0, 0.2]), InputError,
-            "jump 2 of 2: the surface 0.2 m high would begin under the sole that stands 0.25 m before it; place them "
-            "0.34 m apart or more, toe to toe",
-        ),
-        (
-            ([0.6, -0.6], 0.3, [0.2, 0.2]), InputError,
-            "jump 2 of 2: -0.6 m goes back over the platforms; chains with platforms go forward, backward jumps stay "
-            "on the level",
-        ),
+        (([0.6, 0.25], 0.3, [0.0, 0.2]), InputError,
+         "jump 2 of 2: the surface 0.2 m high would begin under the sole that stands 0.25 m before it; place them "
+         "0.34 m apart or more, toe to toe"),
+        (([0.6, -0.6], 0.3, [0.2, 0.2]), InputError,
+         "jump 2 of 2: -0.6 m goes back over the platforms; chains with platforms go forward, backward jumps stay "
+         "on the level"),
     ],
 )  # fmt: skip
 def test_impossible_chains_are_refused_before_any_solve(monkeypatch, arguments, kind, sentence):
