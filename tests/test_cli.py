@@ -272,7 +272,8 @@ def test_real_plan_is_self_contained(planned):
 
 @pytest.mark.slow
 def test_a_real_refusal_and_its_exit_code(capsys, here):
-    assert one_sentence(*run(capsys, "plan", "--out", "p", "--height-m", "1.4"), 3).startswith("whole body: no plan (")
+    said = one_sentence(*run(capsys, "plan", "--out", "p", "--height-m", "1.4", "--patience", "4"), 3)
+    assert said.startswith("whole body: no plan (")
     assert names(here) == []
 
 
