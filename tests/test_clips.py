@@ -206,7 +206,6 @@ def test_a_clip_is_the_jump_in_the_first_mode_in_which_the_engines_agree(world, 
 
 
 def test_a_plan_that_fails_its_audit_is_played_in_one_mode(world, tmp_path, monkeypatch):
-    """No mode would make it pass."""
     bad = SimpleNamespace(failed=[SimpleNamespace(name="torque")], checks=[1])
     monkeypatch.setattr(clips.store, "write_plan", lambda *args, **options: bad)
     monkeypatch.setattr(clips.store, "read_plan", lambda folder: (None, None, {}))

@@ -123,7 +123,6 @@ def test_a_terminal_sees_what_is_going_on(planned):
 
 @pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 def test_the_example_in_the_help_of_each_command_can_be_typed():
-    """`--help` ends with a line that the parser takes; all commands have one."""
     parser, count = cli.make_parser(), 0
     for name, options in common.OPTIONS.items():
         if line := options.get("example"):

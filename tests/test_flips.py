@@ -172,7 +172,6 @@ def test_tuck_forecasts_the_attitude_about_all_axes():
 
 @pytest.mark.slow
 def test_a_rolled_and_yawed_flip_meets_the_ground_with_flat_soles():
-    """Its trunk comes down rolled and yawed, and its soles do not."""
     plan = backflip()
     drawn = Perturbation.draw(plan.robot, TrialKey(0, 9, "", "").robot_seed)
     result = simulate_jump(plan.tape, plan.robot, perturbation=drawn, reaim=True)

@@ -187,7 +187,6 @@ def test_the_middle_of_the_step_is_a_terms_time():
 
 @pytest.mark.parametrize("phase", TERMS)
 def test_every_term_has_a_row_in_the_table(phase):
-    """The table has the blocks that the QPs have."""
     mapper = JointMapper(stage1(), jl.Robot.load())
     program = mapper.step(qp_of(phase, mapper), 0, plain().state(plain().rows(phase).start))[2]
     rows = {r["name"]: r for r in mapper.problem.table() if r["phase"] == phase}

@@ -143,8 +143,8 @@ def test_unknown_names_are_refused(nlp):
     ("parameters", "sentence"),
     [
         *((x, r"^move: parameters .* it takes \['goal'\]$") for x in ({}, {"goal": 1.0, "aim": 2.0}, {"aim": 1.0})),
-        ({"goal": [1.0, 2.0, 3.0]}, ""),
-        ({"goal": "far"}, ""),
+        ({"goal": [1.0, 2.0, 3.0]}, None),
+        ({"goal": "far"}, None),
     ],
 )
 def test_parameters_must_fit(nlp, parameters, sentence):
