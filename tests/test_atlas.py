@@ -99,7 +99,7 @@ def test_other_kinds_of_jumps_are_not_its_business(other):
 
 def test_refusals():
     said = refused(planner().plan, JumpTask(0.6, 0.4), "three-step")
-    assert (said == "method 'three-step': an atlas holds direct plans only; choose 'direct', or leave out the atlas")
+    assert said == "method 'three-step': an atlas holds direct plans only; choose 'direct', or leave out the atlas"
     other = Planner(Robot.load(), limits={"torque_share": 0.8}, atlas=atlas())
     assert refused(other.plan, JumpTask(0.6, 0.4), "direct") == (
         "the atlas of robot bhr does not fit this planner of bhr: robot, limits, terms or mesh differ; build an atlas "

@@ -10,7 +10,7 @@ from pathlib import Path
 import joblib
 import numpy as np
 import pytest
-from fixtures_core import jump, refused
+from fixtures_core import jump, planner, refused
 from scipy.spatial.transform import Rotation
 from test_cli import one_sentence, run
 
@@ -45,7 +45,7 @@ def jumping() -> Clip:
 @cache
 def landed(task, robot="bhr"):
     """A plan and its simulation."""
-    plan = jl.plan(task, robot)
+    plan = planner().plan(task) if robot == "bhr" else jl.plan(task, robot)
     return plan, jl.simulate(plan)
 
 
@@ -127,7 +127,7 @@ def test_what_stands_on_a_platform_is_judged_if_its_height_is_told(fps):
 
 def test_a_turn_on_the_spot_has_a_flight():
     """At its apex feet are as slow as those that stand."""
-    plan = jl.plan(jl.JumpTask(0.0, 0.2, yaw_rad=1.57))
+    plan = planner().plan(jl.JumpTask(0.0, 0.2, yaw_rad=1.57))
     report = jl.judge(plan, fps=100)
     (begin, end) = report.flights[0]
     assert report.passed and end - begin == pytest.approx(plan.tape.t[-1] - plan.tape.takeoff_time, abs=0.15)
@@ -146,7 +146,7 @@ def test_a_joint_leans_on_its_stop_which_takes_what_the_motor_cannot(fps):
 
 
 def test_a_foot_that_swings_low_over_the_ground_does_not_slide():
-    report = jl.judge(jl.plan(jl.JumpTask(-0.3, 0.2)), fps=1000)
+    report = jl.judge(jump(-0.3, 0.2, method="direct"), fps=1000)
     assert report["feet on the ground slide"].passed, report.table()
 
 

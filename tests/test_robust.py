@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
+from fixtures_core import jump, planner
 from paper.margins import ranges_at
 
 import jumplab as jl
@@ -27,13 +28,13 @@ TASK = jl.JumpTask(1.0, 0.5)
 
 @pytest.fixture(scope="module")
 def plans(bhr):
-    return jl.plan(TASK, bhr), jl.plan(TASK, bhr, robust=Ranges())
+    return jump(1.0, 0.5, method="direct"), jl.plan(TASK, bhr, robust=Ranges())
 
 
 @pytest.fixture(scope="module")
 def sideways(bhr):
     task = jl.JumpTask(0.2, 0.3, side_m=0.2)
-    return jl.plan(task, bhr), jl.plan(task, bhr, robust=Ranges())
+    return planner().plan(task), jl.plan(task, bhr, robust=Ranges())
 
 
 def ends_of(plan, model):

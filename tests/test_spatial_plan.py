@@ -32,21 +32,11 @@ from jumplab.robot.stance import configuration, stance_angles
 from jumplab.sim import STEP_S, simulate_jump
 from jumplab.sim.scene import Scene
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Contacts, Limits, Mesh, Place, Weights, WholeBodyPlanner
+from jumplab.stages.whole_body import Contacts, Limits, Mesh, Place, Weights, WholeBodyPlanner, between
 from jumplab.stages.whole_body import plan as ended
 from jumplab.stages.whole_body import planner as planning
 from jumplab.stages.whole_body.apart import MORE_M, NODES, face_gaps, merged, placed, too_close, used_apart
-from jumplab.stages.whole_body.between import (
-    ACCELERATION_GAP,
-    CLEAR_M,
-    FRICTION,
-    LOADED_N,
-    MIDDLE,
-    PRESSURE_GAP,
-    RATE_GAP,
-    SUNK_M,
-    used_between,
-)
+from jumplab.stages.whole_body.between import used_between
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.coordinates import BASE, even
 from jumplab.stages.whole_body.ground import Surface, surface_of_jump
@@ -119,7 +109,7 @@ def test_tape_is_smooth_up_to_each_take_off_and_landing(name):
     moves = np.setdiff1d(np.arange(len(dt)), twice)
     mean = (tape.v[1:, 6:] + tape.v[:-1, 6:]) / 2
     gap = np.diff(tape.q[:, 7:], axis=0)[moves] / dt[moves] - mean[moves]
-    assert np.abs(gap).max() < RATE_GAP
+    assert np.abs(gap).max() < between.RATE_GAP
 
 
 @pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
@@ -335,11 +325,9 @@ def test_a_motion_that_breaks_limits_between_the_nodes_is_none(doubted):
 def test_limits_between_the_nodes_are_seen(bhr):
     tape = jump(SIDE).tape
     assert 0.5 < used_between(tape, bhr) <= 1
-    assert [LIMITS[f"{x} against {y}"].limit for x, y in (("rates", "positions"), ("accelerations", "rates"))] == [
-        RATE_GAP,
-        ACCELERATION_GAP,
-    ]
-    assert (FRICTION, LOADED_N) == (LIMITS["friction used"].limit, METHOD.friction_force_n)
+    limits = [LIMITS[name].limit for name in ("rates against positions", "accelerations against rates")]
+    assert limits == [between.RATE_GAP, between.ACCELERATION_GAP]
+    assert (between.FRICTION, between.LOADED_N) == (LIMITS["friction used"].limit, METHOD.friction_force_n)
     row, effort = len(tape.t) // 3, bhr.actuators["left_ankle_pitch"]["effort"]
     for name, column, change in (("tau", bhr.joint_names.index("left_ankle_pitch"), effort), ("v", 12, 0.05)):
         moved = getattr(tape, name).copy()
@@ -352,31 +340,30 @@ def test_limits_between_the_nodes_are_seen(bhr):
     assert np.all(tape.extra["contacts"][row] == FLAT)
     for share in (0.99, 1.01):
         pushed = tape.f.copy()
-        aside = share * FRICTION * below
+        aside = share * between.FRICTION * below
         pushed[row, 0, :2] = 0.0, aside
         pushed[row, 0, 3:5] += down * (aside - tape.f[row, 0, 1]), down * ahead  # the CoP stays
         used = used_between(replace(tape, f=pushed), bhr)
         assert (used <= 1) == (share < 1) and used >= share - 1e-9
     for share in (0.9, 1.5):
         pushed = tape.f.copy()
-        pushed[row, 0, 4] = -down * ahead - (bhr.foot.toe + share * PRESSURE_GAP) * below  # the CoP beyond the toes
+        pushed[row, 0, 4] = (
+            -down * ahead - (bhr.foot.toe + share * between.PRESSURE_GAP) * below
+        )  # the CoP beyond the toes
         used = used_between(replace(tape, f=pushed), bhr)
         assert used == pytest.approx(max(share, used_between(tape, bhr)), abs=1e-6)
 
 
 def test_soles_that_are_low_between_the_nodes_are_seen(bhr):
     """2 cm in the middle of a flight as the audit asks, 1 mm in the ground elsewhere; also on a platform."""
-    assert (CLEAR_M, SUNK_M, MIDDLE) == (
-        1e-3 * LIMITS["foot clearance"].limit,
-        1e-3 * LIMITS["penetration"].limit,
-        tuple(METHOD.mid_flight),
-    )
+    asked = 1e-3 * LIMITS["foot clearance"].limit, 1e-3 * LIMITS["penetration"].limit, tuple(METHOD.mid_flight)
+    assert (between.CLEAR_M, between.SUNK_M, between.MIDDLE) == asked
     plan = jl.plan(jl.JumpTask(0.6, 0.4, 0.15), bhr)
     tape, body = plan.tape, plan.whole_body
     surface = Surface(0.15, bhr.foot.toe - float(bhr.foot.center[0]) + body.edge_m)
     assert body.used == pytest.approx(used_between(tape, bhr, surface), abs=1e-9) and body.used <= 1
     flying = np.flatnonzero(tape.phase == "flight")
-    for part, low, depth in ((0.5, CLEAR_M, 0.001), (0.99, 0.0, 0.002)):
+    for part, low, depth in ((0.5, between.CLEAR_M, 0.001), (0.99, 0.0, 0.002)):
         k = flying[int(part * len(flying))]
         moved = tape.q.copy()
         moved[k, 2] -= _lowest(bhr, tape.q[k], surface) - low + depth

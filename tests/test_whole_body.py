@@ -5,7 +5,6 @@ import pinocchio as pin
 import pytest
 from fixtures_core import LIMBS, jump, pendulum, planner, replay
 
-import jumplab as jl
 from jumplab.auditing import audit
 from jumplab.errors import SolverError
 from jumplab.ocp import Nlp
@@ -78,10 +77,10 @@ def test_time_that_other_threads_spent_is_not_its_own(monkeypatch):
             raise SolverError("no time", status=OUT_OF_TIME, iterations=1)
         return solve(nlp, **given)
 
-    alone = jl.plan(task)
+    alone = planner().plan(task)
     monkeypatch.setattr(Nlp, "with_options", optioned)
     monkeypatch.setattr(Nlp, "solve", late)
-    plan = jl.plan(task)
+    plan = planner().plan(task)
     assert [x.status for x in plan.attempts] == [x.status for x in alone.attempts]
     np.testing.assert_array_equal(plan.tape.q, alone.tape.q)
     assert [x / limits[0] for x in limits[:3]] == pytest.approx([1.0, 2.0, 4.0])
