@@ -35,6 +35,14 @@ def tape():
 
 
 @pytest.fixture
+def folder(tmp_path):
+    """A folder that holds that jump."""
+    from fixtures_core import on_file
+
+    return on_file(tmp_path / "plan")
+
+
+@pytest.fixture
 def odd_folder(tmp_path):
     """A folder whose path has a space, letters beyond ASCII, braces and a dollar sign."""
     folder = tmp_path / "Sprünge und 跳跃 {x} $HOME"

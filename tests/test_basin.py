@@ -13,11 +13,6 @@ from jumplab.studies.trials import Trial, TrialSettings
 SMALL = BasinGrid((1.0,), (0.0, 30.0), (0.0,), (0.6,))
 
 
-@pytest.fixture
-def folder(tmp_path):
-    return on_file(tmp_path / "plan")
-
-
 def fake(plan, settings, key, state):
     """Stands in for a simulation: too much pitch falls."""
     landed = abs(state.pitch_deg) < 7

@@ -26,11 +26,6 @@ def held(folder) -> set[str]:
     return set(names(folder))
 
 
-@pytest.fixture
-def folder(tmp_path):
-    return on_file(tmp_path / "plan")
-
-
 def measured(**changed) -> Metrics:
     """A landing as it might be measured."""
     none = dict(max_torque_ratio_by_joint={}, max_speed_ratio_by_joint={}, saturated_s={}, overspeed_s={})

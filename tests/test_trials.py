@@ -30,11 +30,6 @@ from jumplab.studies.trials import PlanOnFile, Trial, TrialKey, TrialSettings, r
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.fixture
-def folder(tmp_path):
-    return on_file(tmp_path / "plan")
-
-
 @pytest.fixture(scope="module")
 def real(tmp_path_factory):
     """One trial for real: its folder, its report, and the simulation that it was."""
