@@ -34,6 +34,22 @@ def tape():
     return jump(0.6, 0.3, method="direct").tape
 
 
+@pytest.fixture(scope="session")
+def plan():
+    """A long jump of the default robot, by three steps."""
+    from fixtures_core import jump
+
+    return jump(1.0, 0.5)
+
+
+@pytest.fixture(scope="session")
+def simulation():
+    """That jump, simulated."""
+    from fixtures_core import simulated
+
+    return simulated(1.0, 0.5)
+
+
 @pytest.fixture
 def folder(tmp_path):
     """A folder that holds that jump."""

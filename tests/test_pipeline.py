@@ -19,11 +19,6 @@ from jumplab.stages.whole_body import WholeBodyPlanner, motions
 from jumplab.task import JumpTask
 
 
-@pytest.fixture(scope="module")
-def plan():
-    return jump(1.0, 0.5)
-
-
 @pytest.mark.slow
 def test_three_steps_and_one(plan):
     direct = jump(1.0, 0.5, 0.0, "direct")

@@ -15,7 +15,7 @@ import matplotlib.image
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump, on_file, refused, simulated
+from fixtures_core import jump, on_file, refused
 from scipy.spatial import cKDTree
 from test_cli import one_sentence, run
 from test_store import names
@@ -40,11 +40,6 @@ FLAGS = (
 STAGE = slice(64, 555)  # rows of a picture between the header and the curves
 published = pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
-
-
-@pytest.fixture(scope="module")
-def simulation():
-    return simulated(1.0, 0.5)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import io
 import matplotlib.image
 import numpy as np
 import pytest
-from fixtures_core import jump, simulated
+from fixtures_core import jump
 from test_show_page import CHROMIUM, FLAGS, STAGE, browser, count, published
 
 import jumplab as jl
@@ -43,11 +43,6 @@ FAULTS = """() => {
 }"""
 # where the base of the robot that leads is on the picture, -1 ... 1 from left to right
 BASE = "() => { viewer.camera.updateMatrixWorld(); return upright(base(lead, now)).project(viewer.camera).x; }"
-
-
-@pytest.fixture(scope="module")
-def simulation():
-    return simulated(1.0, 0.5)
 
 
 @pytest.fixture(scope="module")

@@ -12,18 +12,13 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from fixtures_core import jump, refused
+from fixtures_core import refused
 from matplotlib.colors import to_rgb
 
 import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.show import jumps
 from jumplab.sim import SimulationResult
-
-
-@pytest.fixture(scope="module")
-def plan():
-    return jump(1.0, 0.5)
 
 
 def test_a_plan_and_its_stages_are_a_line_each(plan):
