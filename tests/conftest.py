@@ -43,6 +43,12 @@ def plan():
 
 
 @pytest.fixture(scope="session")
+def good(plan):
+    """Its tape."""
+    return plan.tape
+
+
+@pytest.fixture(scope="session")
 def simulation():
     """That jump, simulated."""
     from fixtures_core import simulated

@@ -23,7 +23,6 @@ from fixtures_audit import (
     drop_row,
     edit,
     everywhere,
-    good_tape,
     joint,
     moved_cop,
     put,
@@ -34,13 +33,7 @@ from fixtures_audit import (
 from fixtures_core import jump
 
 from jumplab.auditing import AuditReport, audit
-from jumplab.io.tape import Tape
 from jumplab.task import JumpTask
-
-
-@pytest.fixture(scope="module")
-def good() -> Tape:
-    return good_tape()
 
 
 def pulling(f, takeoff):

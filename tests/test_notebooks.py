@@ -18,6 +18,7 @@ from fixtures_core import refused
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from paper import running
 from PIL import Image
+from test_store import names
 
 from jumplab.cli import notebooks
 from jumplab.errors import InputError, JumplabError, SolverError
@@ -56,10 +57,6 @@ def make_notebook(folder, name, *cells, parameters=PARAMETERS):
     path.parent.mkdir(exist_ok=True)
     nbformat.write(nb, path)
     return path
-
-
-def names(folder):
-    return sorted(p.name for p in folder.iterdir())
 
 
 # ------------------------------------------------------------------------------------------ the runner

@@ -6,20 +6,14 @@ import numpy as np
 import pytest
 from fixtures_core import jump, planner, refused
 from test_solver import flat_guess, move
-from test_transcription import toy
+from test_transcription import assembled as assembled
 
 from jumplab.auditing.audit import audit
-from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import GOOD_STATUSES, WARM, Nlp, PhaseGuess
 from jumplab.ocp.posing import pack, pack_multipliers, unpack, unpack_multipliers
 from jumplab.ocp.problem import Term
 from jumplab.stages import planner as pipeline
 from jumplab.task import JumpTask
-
-
-@pytest.fixture(scope="module")
-def assembled():
-    return Assembled(toy())
 
 
 def test_packing_and_unpacking_are_inverse(assembled):
