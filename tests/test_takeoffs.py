@@ -5,6 +5,7 @@ from functools import cache
 
 import pytest
 from fixtures_core import refused
+from test_advice import raised
 
 import jumplab as jl
 from jumplab.auditing import audit
@@ -181,17 +182,9 @@ def test_advice_names_the_run_up_that_reaches_the_distance(monkeypatch):
             if task.distance_m > (1.0 if task.run_up else 0.5):
                 raise InfeasibleError("too far")
 
-    monkeypatch.setattr(advice, "refused", lambda planner, task, method: _raised(planner.plan, task, method))
+    monkeypatch.setattr(advice, "refused", lambda planner, task, method: raised(planner.plan, task, method))
     near = "too far; ask for a distance of 0.48 m, which has a plan; or for a run-up of 2 steps (takeoff='left', "
     near += "run_up=2), which reaches 0.8 m"
     far = "too far; ask for a distance of 0.43 m and a height of 0.06 m, which has a plan"
     for distance, words in ((0.8, near), (1.2, far)):
         assert refused(advice.plan_or_advise, Fake(), jl.JumpTask(distance, 0.1), by=InfeasibleError) == words
-
-
-def _raised(call, *given):
-    try:
-        call(*given)
-    except InfeasibleError as e:
-        return e
-    return None
