@@ -18,7 +18,6 @@ from jumplab.io import export
 from jumplab.io.motion import Motion
 from jumplab.ocp.nlp import RESIDUAL_LIMIT
 from jumplab.robot import Robot
-from jumplab.stages.plan import JumpPlan
 from jumplab.stages.whole_body import Limits, Weights
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.mode import Mode
@@ -164,20 +163,26 @@ def test_feet_that_carry_little_after_a_landing_need_no_finer_mesh():
     assert plan.whole_body.used < 1 and jl.audit(plan).passed
 
 
+@pytest.fixture(scope="module")
+def mended():
+    return jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
+
+
 @NO_ROBOTS
 @pytest.mark.slow
-def test_a_nearest_motion_that_fails_its_audit_is_none(monkeypatch):
+def test_a_nearest_motion_that_fails_its_audit_is_none(mended, monkeypatch):
+    audit = SimpleNamespace(failed=[SimpleNamespace(name="base residual")])
+    plan = SimpleNamespace(audit=audit, whole_body=mended.plan.whole_body)
     monkeypatch.setattr(study, "FACTORS", (0.8,))
-    monkeypatch.setattr(JumpPlan, "audit", SimpleNamespace(failed=[SimpleNamespace(name="base residual")]))
+    monkeypatch.setattr(study.Planner, "follow", lambda *_, **how: plan)
     sentence = r"the nearest motion fails its audit \(base residual\), pressed by .+; nor can it with 0\.8 of"
     with pytest.raises(InfeasibleError, match=sentence):
-        jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
+        jl.mend(mended.before)
 
 
 @NO_ROBOTS
 @pytest.mark.slow
-def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
-    mended = jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
+def test_a_public_clip_is_mended_audited_and_stands(mended, tmp_path):
     rows = {row["what"]: row for row in mended.changes}
     assert jl.audit(mended.plan).passed and not mended.before.passed
     for fps in (50, 100):
