@@ -8,13 +8,16 @@ from xml.etree import ElementTree as ET
 import fixtures_core
 import numpy as np
 import pinocchio as pin
+import pytest
 from paper import bhr_table as table
 
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
 from jumplab.robot.sagittal import SagittalModel
 from jumplab.robot.stance import com_from_toe, configuration
+from jumplab.robot_import.urdf import have_published
 
+needs_published = pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 GOOD = table.URDF_PATH.read_text()
 CONFIG = """
 name = "{name}"

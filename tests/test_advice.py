@@ -10,11 +10,11 @@ from functools import cache
 
 import pytest
 from fixtures_core import refused
+from fixtures_robots import needs_published
 
 import jumplab as jl
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.ocp.nlp import left_s, patience
-from jumplab.robot_import.urdf import have_published
 from jumplab.studies import advice
 from jumplab.task import JumpTask
 
@@ -163,7 +163,7 @@ def robot_of(name):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
+@needs_published
 def test_refusals_of_five_robots_are_followed():
     """Random targets beyond what they can do; each advice is followed by a planner that has not seen it before."""
     rng, followed, tried = random.Random(7), 0, 0

@@ -11,6 +11,7 @@ import joblib
 import numpy as np
 import pytest
 from fixtures_core import jump, planner, refused
+from fixtures_robots import needs_published
 from scipy.spatial.transform import Rotation
 from test_cli import one_sentence, run
 
@@ -22,12 +23,10 @@ from jumplab.io.motion import Motion
 from jumplab.io.whole import ordered
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.robot_import.urdf import have_published
 
 CLIPS = Path(__file__).parent / "clips"
 FILES = [name for name in export.FORMATS if Path(export.FORMATS[name][0]).suffix]
 assert len(FILES) == len(export.FORMATS) - 2  # all but the two folders
-NO_ROBOTS = pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 
 
 @cache
@@ -133,7 +132,7 @@ def test_a_turn_on_the_spot_has_a_flight():
     assert report.passed and end - begin == pytest.approx(plan.tape.t[-1] - plan.tape.takeoff_time, abs=0.15)
 
 
-@NO_ROBOTS
+@needs_published
 @pytest.mark.parametrize("fps", [30, 100])
 def test_a_joint_leans_on_its_stop_which_takes_what_the_motor_cannot(fps):
     """As the waist of a G1 does when it has landed, with its motor spent."""
@@ -279,7 +278,7 @@ FLIGHTS = {"CR7_level1": [(1.53, 2.13)], "jump_forward_level2": [(1.70, 2.10)], 
 FLOAT_MM = {"CR7_level1": 71, "jump_forward_level2": 68, "side_jump_level2": 13}
 
 
-@NO_ROBOTS
+@needs_published
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_a_public_clip_flies_when_it_was_seen_to_and_is_not_physical(name):
     report = jl.judge(CLIPS / f"{name}.pkl", "g1")

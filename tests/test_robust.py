@@ -8,13 +8,13 @@ import casadi as ca
 import numpy as np
 import pytest
 from fixtures_core import jump, planner
+from fixtures_robots import needs_published
 from paper.margins import ranges_at
 
 import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.models.spatial import SpatialModel
 from jumplab.ocp.problem import Point
-from jumplab.robot_import.urdf import have_published
 from jumplab.sim import Perturbation, Ranges, Scene, simulate_jump
 from jumplab.stages.changes import settled
 from jumplab.stages.planner import Planner
@@ -91,7 +91,7 @@ def test_a_robust_plan_brings_sampled_robots_to_rest_nearer_to_the_middle(bhr, p
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
+@needs_published
 def test_a_robot_of_many_joints_has_robust_plans(monkeypatch):
     monkeypatch.setattr(robust, "SAMPLES", 2)  # trees of many joints take long to differentiate
     task, g1 = jl.JumpTask(0.2, 0.15), jl.Robot.load("g1_arms")

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import refused
+from fixtures_robots import needs_published
 from paper.basin import WrongApex
 from scipy.interpolate import CubicHermiteSpline
 
@@ -18,7 +19,6 @@ from jumplab.control.kinematics import Gauge, rotation
 from jumplab.control.playback import Playback
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.robot.stance import stance_configuration
-from jumplab.robot_import.urdf import have_published
 from jumplab.sim import INSTALLED, Perturbation, Ranges, SensorNoise, simulate_jump
 from jumplab.stages.whole_body.settings import Limits
 
@@ -190,7 +190,7 @@ def test_after_a_step_down_the_cop_is_judged_at_the_height_of_the_lower_ground(b
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
+@needs_published
 def test_shanks_keep_off_an_edge_that_the_robot_steps_down_from():
     plan = jl.plan(robot="g1_arms", contacts="step_off=0.3")
     assert plan.audit.passed, plan.audit.table()

@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump, on_file, refused
+from fixtures_robots import needs_published
 from scipy.spatial import cKDTree
 from test_cli import one_sentence, run
 from test_store import names
@@ -25,7 +26,7 @@ from jumplab.io.motion import Motion
 from jumplab.robot import Robot
 from jumplab.robot.files import files_of
 from jumplab.robot_import.checkup import examine
-from jumplab.robot_import.urdf import have_published, locate
+from jumplab.robot_import.urdf import locate
 from jumplab.show import shapes
 from jumplab.show import viewer as viewer
 from jumplab.show.style import PHASE_COLORS
@@ -38,7 +39,6 @@ FLAGS = (
     "--window-size=1280,720 --virtual-time-budget=4000 --enable-logging=stderr"
 ).split()
 STAGE = slice(64, 555)  # rows of a picture between the header and the curves
-published = pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
 
 
@@ -178,7 +178,7 @@ def test_rounded_body_stands_on_the_soles_between_the_joints(bhr):
         assert np.einsum("ij,ij->i", a, np.cross(b, c)).min() > -1e-12
 
 
-@published
+@needs_published
 @pytest.mark.parametrize("name", ["g1_legs", "talos"])
 def test_meshes_of_a_published_robot_lie_where_its_urdf_puts_them(name):
     """Pinocchio places the same meshes by the published URDF: all fill the same space, but for the coarseness."""
@@ -206,7 +206,7 @@ def test_meshes_of_a_published_robot_lie_where_its_urdf_puts_them(name):
     assert max(away) < 0.02, away  # no point is missing, none is elsewhere
 
 
-@published
+@needs_published
 def test_without_the_files_a_published_robot_is_drawn_from_boxes_and_the_page_says_so(monkeypatch):
     robot = Robot.load("g1_legs")
     monkeypatch.setattr("jumplab.robot_import.urdf.have_published", lambda: False)

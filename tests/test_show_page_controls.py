@@ -9,7 +9,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 from fixtures_core import jump
-from test_show_page import CHROMIUM, FLAGS, STAGE, browser, count, published
+from fixtures_robots import needs_published
+from test_show_page import CHROMIUM, FLAGS, STAGE, browser, count
 
 import jumplab as jl
 from jumplab.io.motion import Motion
@@ -201,7 +202,7 @@ def test_a_loop_begins_again(tab, url):
     assert tab.locator("#play").inner_text() == "❚❚" and tab.trouble == []
 
 
-@published
+@needs_published
 def test_meshes_of_a_published_robot(tab, tmp_path):
     page = jl.view(jl.plan(jl.JumpTask(0.4, 0.2), "g1"))
     file = page.save(tmp_path / "g1.html")

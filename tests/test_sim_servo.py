@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import refused
+from fixtures_robots import needs_published
 
 from jumplab.control import servo as law
 from jumplab.control.body import WholeBody
@@ -16,13 +17,10 @@ from jumplab.control.servo import SERVOS, STIFFNESS, PositionServo, TorqueServo,
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.robot_import.urdf import have_published
 from jumplab.sim import STEP_S, Perturbation, simulate_jump
 from jumplab.sim.motors import Motors
 
-G1 = pytest.param(
-    "g1_arms", marks=pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
-)
+G1 = pytest.param("g1_arms", marks=needs_published)
 
 
 def told(robot, posture, **changed) -> Command:
