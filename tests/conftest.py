@@ -26,6 +26,44 @@ def bhr():
     return Robot.load()
 
 
+@pytest.fixture(scope="session")
+def tape():
+    """A small jump of the default robot, by the direct planner."""
+    from fixtures_core import jump
+
+    return jump(0.6, 0.3, method="direct").tape
+
+
+@pytest.fixture(scope="session")
+def plan():
+    """A long jump of the default robot, by three steps."""
+    from fixtures_core import jump
+
+    return jump(1.0, 0.5)
+
+
+@pytest.fixture(scope="session")
+def good(plan):
+    """Its tape."""
+    return plan.tape
+
+
+@pytest.fixture(scope="session")
+def simulation():
+    """That jump, simulated."""
+    from fixtures_core import simulated
+
+    return simulated(1.0, 0.5)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder that holds that jump."""
+    from fixtures_core import on_file
+
+    return on_file(tmp_path / "plan")
+
+
 @pytest.fixture
 def odd_folder(tmp_path):
     """A folder whose path has a space, letters beyond ASCII, braces and a dollar sign."""

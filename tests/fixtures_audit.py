@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pinocchio as pin
-from fixtures_core import jump
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -26,11 +25,6 @@ def joint(name: str) -> int:
 
 
 KNEE, HIP = joint("left_knee"), joint("left_hip_pitch")
-
-
-def good_tape() -> Tape:
-    """The paper's jump by its three steps."""
-    return jump(1.0, 0.5).tape
 
 
 def edit(tape: Tape, **changes) -> Tape:

@@ -1,5 +1,6 @@
-"""Fixtures of the core's tests: jumps planned once per session, tapes looked at again, planar motions."""
+"""Fixtures of the core's tests: refusals, jumps planned once per session, tapes looked at again, planar motions."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
@@ -8,14 +9,25 @@ from pathlib import Path
 import grimp
 import numpy as np
 import pinocchio as pin
+import pytest
 
+from jumplab.errors import InputError
+from jumplab.io import folder as store
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration
+from jumplab.sim import SimulationResult, simulate_jump
 from jumplab.stages.planner import JumpPlan, Planner
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.task import JumpTask
 
 LIMBS = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
+
+
+def refused(call: Callable, *arguments, by: type[Exception] = InputError, **options) -> str:
+    """The sentence that refuses a call."""
+    with pytest.raises(by) as e:
+        call(*arguments, **options)
+    return str(e.value)
 
 
 def slopes(f, x: np.ndarray, step: float, ways: np.ndarray | None = None) -> np.ndarray:
@@ -34,6 +46,20 @@ def planner() -> Planner:
 def jump(distance_m: float, height_m: float, platform_m: float = 0.0, method: str = "three-step") -> JumpPlan:
     """One finished plan per target and method."""
     return planner().plan(JumpTask(distance_m, height_m, platform_m), method)
+
+
+@cache
+def simulated(distance_m: float, height_m: float) -> SimulationResult:
+    """One simulation per jump of three steps, by the usual engine and mode."""
+    plan = jump(distance_m, height_m)
+    return simulate_jump(plan.tape, plan.robot)
+
+
+def on_file(folder: Path, plan: JumpPlan | None = None) -> Path:
+    """A folder that holds a plan, by default that of a small jump."""
+    plan = plan or jump(0.6, 0.3, method="direct")
+    store.write_plan(folder, plan.tape, plan.robot, plan.summary)
+    return folder
 
 
 @cache

@@ -1,10 +1,11 @@
 """Robots made from the default one by hand: other proportions, axes, ankles, arms and base links."""
 
 import pickle
-from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from xml.etree import ElementTree as ET
 
+import fixtures_core
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -14,7 +15,9 @@ from jumplab.errors import RobotError
 from jumplab.robot import Robot
 from jumplab.robot.sagittal import SagittalModel
 from jumplab.robot.stance import com_from_toe, configuration
+from jumplab.robot_import.urdf import have_published
 
+needs_published = pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 GOOD = table.URDF_PATH.read_text()
 CONFIG = """
 name = "{name}"
@@ -41,6 +44,7 @@ shoulder_rad = 0.0
 [actuators]
 corner_speed_ratio = 0.5
 """
+refused = partial(fixtures_core.refused, by=RobotError)
 SWINGING = '["left_shoulder_pitch", "right_shoulder_pitch"]'
 
 
@@ -48,13 +52,6 @@ def config(name: str, size: float = 1.0, **values) -> str:
     told = {"trunk": "trunk", "forward": "+x", "up": "+z", "shoulders": SWINGING, "heel": -0.1 * size,
             "toe": 0.14 * size, "half": 0.05 * size, "z": -0.075 * size}  # fmt: skip
     return CONFIG.format(name=name, **(told | values))
-
-
-def refused(make: Callable[[], object]) -> str:
-    """The sentence that refuses to make something."""
-    with pytest.raises(RobotError) as e:
-        make()
-    return str(e.value)
 
 
 def root() -> ET.Element:

@@ -23,7 +23,6 @@ from fixtures_audit import (
     drop_row,
     edit,
     everywhere,
-    good_tape,
     joint,
     moved_cop,
     put,
@@ -34,13 +33,7 @@ from fixtures_audit import (
 from fixtures_core import jump
 
 from jumplab.auditing import AuditReport, audit
-from jumplab.io.tape import Tape
 from jumplab.task import JumpTask
-
-
-@pytest.fixture(scope="module")
-def good() -> Tape:
-    return good_tape()
 
 
 def pulling(f, takeoff):
@@ -158,14 +151,8 @@ def test_good_plan_is_clean(good):
     assert all(
         math.isfinite(c.value) and math.isfinite(c.limit) and c.unit and len(c.note) > 15 for c in passport.checks
     )
-    timeless = {
-        "finite numbers",
-        "order of phases",
-        "gravity in flight",
-        "mass",
-        "sole as in the URDF",
-        "links have mass",
-    }
+    timeless = {"finite numbers", "order of phases", "gravity in flight", "mass", "sole as in the URDF",
+                "links have mass"}  # fmt: skip
     assert {c.name for c in passport.checks if c.time is None} == timeless
     assert all(0 <= c.time <= good.t[-1] for c in passport.checks if c.time is not None)
     assert audit(good, ROBOT, TASK).to_json() == passport.to_json()
@@ -203,8 +190,7 @@ def test_landing_on_a_platform_that_is_not_there(good):
 
 
 @pytest.mark.parametrize(
-    "target",
-    [(0.6, 0.5, 0.3), (0.6, 0.5, -0.2), (1.0, 0.5, 0.0, "direct"), (0.3, 0.2, 0.0, "direct"), (0.0, 0.1)],
+    "target", [(0.6, 0.5, 0.3), (0.6, 0.5, -0.2), (1.0, 0.5, 0.0, "direct"), (0.3, 0.2, 0.0, "direct"), (0.0, 0.1)]
 )
 def test_other_good_plans_are_clean(target):
     """Onto and off a platform; the direct planner; and small hops, whose feet pass closest to the ground."""

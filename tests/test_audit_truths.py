@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_audit import ROBOT, good_tape, with_forces
+from fixtures_audit import ROBOT, with_forces
 
 from jumplab.auditing import audit
 from jumplab.auditing.motion import capture, foot_turn
@@ -17,12 +17,6 @@ from jumplab.auditing.replay import replay
 from jumplab.io.tape import Tape
 from jumplab.robot.stance import com_from_toe, stance_angles, stance_configuration
 from jumplab.task import JumpTask
-
-
-@pytest.fixture(scope="module")
-def good() -> Tape:
-    return good_tape()
-
 
 # ------------------------------------------------------------------------ closed forms, no planner: statue, then top
 

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_audit import ROBOT, robot_with
+from fixtures_core import refused
 from test_audit_amounts import JOINTS, random_tape, truth
 
 from jumplab.auditing import AuditReport, Check, audit, write_audit
@@ -194,9 +195,7 @@ def test_what_is_no_tape_no_robot_and_no_target():
         ((tape, ROBOT), {"edge_m": True}, "edge_m must be a number, got True"),
         ((tape, ROBOT), {"edge_m": math.nan}, "edge_m must be finite, got nan"),
     ):
-        with pytest.raises(InputError) as e:
-            audit(*arguments, **options)
-        assert str(e.value) == sentence
+        assert refused(audit, *arguments, **options) == sentence
     assert audit(tape, ROBOT, TASK, edge_m=1).checks == audit(tape, ROBOT, TASK, edge_m=1.0).checks
 
 
@@ -206,9 +205,8 @@ def test_a_tape_of_another_robot_word_for_word():
     sizes = {"q": ((n, 21), (n, 20)), "v": ((n, 20), (n, 19)), "a": ((n, 20), (n, 19)), "tau": ((n, 14), (n, 13)),
              "f": ((n, 2, 6), (n, 2, 5))}  # fmt: skip
     for name, (needs, has) in sizes.items():
-        with pytest.raises(InputError) as e:
-            audit(dataclasses.replace(tape, **{name: getattr(tape, name)[..., :-1]}), ROBOT)
-        assert str(e.value) == f"tape: {name} has shape {has}, the robot 'bhr' needs {needs}"
+        said = refused(audit, dataclasses.replace(tape, **{name: getattr(tape, name)[..., :-1]}), ROBOT)
+        assert said == f"tape: {name} has shape {has}, the robot 'bhr' needs {needs}"
     cases = {
         "tape: its joints are not those of the robot 'bhr' in the same order; plan the jump again with this robot": {
             "joint_names": tape.joint_names[::-1]
@@ -221,9 +219,7 @@ def test_a_tape_of_another_robot_word_for_word():
         },
     }  # fmt: skip
     for sentence, changes in cases.items():
-        with pytest.raises(InputError) as e:
-            audit(dataclasses.replace(tape, **changes), ROBOT)
-        assert str(e.value) == sentence
+        assert refused(audit, dataclasses.replace(tape, **changes), ROBOT) == sentence
 
 
 def test_a_urdf_that_pinocchio_cannot_read():
@@ -409,6 +405,5 @@ def test_a_folders_target_edge_and_place(tmp_path):
     with pytest.raises(InputError, match=r"^the plan in .* cannot be read \(No such file or directory\)$"):
         write_audit(tmp_path)
     store.write_plan(tmp_path, tape, ROBOT, {"target": {"distance_m": 1.0}})
-    with pytest.raises(InputError, match=r"^a target has a distance_m and a height_m; plan the jump again$"):
-        write_audit(tmp_path)
+    assert refused(write_audit, tmp_path) == "a target has a distance_m and a height_m; plan the jump again"
     assert not (tmp_path / "passport.json").exists()

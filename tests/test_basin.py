@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from fixtures_core import jump
+from fixtures_core import on_file
 from paper import basin
 from paper.basin import BasinGrid, landing_basin
 
@@ -11,17 +11,6 @@ from jumplab.io import folder as store
 from jumplab.studies.trials import Trial, TrialSettings
 
 SMALL = BasinGrid((1.0,), (0.0, 30.0), (0.0,), (0.6,))
-
-
-@pytest.fixture(scope="module")
-def plan(bhr):
-    return jump(0.6, 0.3, method="direct")
-
-
-@pytest.fixture
-def folder(plan, bhr, tmp_path):
-    store.write_plan(tmp_path / "plan", plan.tape, bhr, plan.summary)
-    return tmp_path / "plan"
 
 
 def fake(plan, settings, key, state):
@@ -44,7 +33,7 @@ def test_the_grid_has_all_combinations_once():
     }  # any first part of it has something of everything
 
 
-def test_counts_and_resumes(folder, fakes, bhr):
+def test_counts_and_resumes(folder, fakes):
     for n, words in ((0, "too small; it must be at least 1"), (226, "too large; the basin has 225 states")):
         with pytest.raises(InputError, match=f"^n = {n} is {words}$"):
             landing_basin(folder, n)
@@ -59,7 +48,7 @@ def test_counts_and_resumes(folder, fakes, bhr):
     assert said["reasons"] == {"trunk touched the ground ... s": 90}
     assert landing_basin(folder, settings=TrialSettings(reaim=False), jobs=1).resumed == 0
     assert landing_basin(folder, 5, grid=BasinGrid(speed_factor=(1.0,)), jobs=1).resumed > 0  # the same states
-    store.write_plan(folder, jump(0.6, 0.3, method="direct").tape, bhr, store.read_plan(folder)[2])
+    on_file(folder)
     assert not {"basin.json", "trials.jsonl"} & {f.name for f in folder.iterdir()}  # a new plan, a new basin
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump, planner
+from fixtures_robots import needs_published
 from paper import records
 from scipy.optimize import linprog
 
 import jumplab as jl
 from jumplab.errors import InfeasibleError, InputError, JumplabError
 from jumplab.robot.contact import on_feet
-from jumplab.robot_import.urdf import have_published
 from jumplab.stages.whole_body import Limits, WholeBodyPlanner
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.bounds import most, reach_and_start
@@ -22,7 +22,6 @@ from jumplab.studies import advice
 from jumplab.task import RANGES
 
 STEPS = 60  # of a push
-published = pytest.mark.skipif(not have_published(), reason="needs the published robots")
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,7 @@ def test_no_plan_of_the_default_robot_beats_a_bound(body, target):
     assert plan.planned_apex_m <= reach + plan.planned_rise_m
 
 
-@published
+@needs_published
 @pytest.mark.parametrize(("robot", "rise"), [("g1_legs", 0.2), ("talos", 0.08)])
 def test_no_plan_of_a_published_robot_beats_a_bound(robot, rise):
     plan = jl.plan(jl.JumpTask(0.3, rise), robot)
@@ -115,16 +114,13 @@ def test_bounds_grow_with_what_they_are_made_of(body):
 @pytest.mark.parametrize(
     ("task", "number", "sentence"),
     [
-        (
-            jl.JumpTask(3.0, 0.02),
-            "distance_m",
-            r"a travel of 3 m with a rise of 0.02 m is impossible for robot bhr: .* 2.95 m",
-        ),
+        (jl.JumpTask(3.0, 0.02), "distance_m",
+         r"a travel of 3 m with a rise of 0.02 m is impossible for robot bhr: .* 2.95 m"),
         (jl.JumpTask(-3.0, 0.02), "distance_m", "a travel of 3 m with a rise of 0.02 m is impossible"),
         (jl.JumpTask(0.0, 0.02, side_m=3.0), "side_m", "a travel of 3 m"),
         (jl.JumpTask(1.0, 0.05, platform_m=1.0), "platform_m", "a platform of 1 m with a rise of 0.05 m is impossible"),
     ],
-)
+)  # fmt: skip
 def test_what_is_beyond_a_bound_is_refused_before_anything_is_solved(task, number, sentence, monkeypatch):
     monkeypatch.setattr(WholeBodyPlanner, "plan", None)
     with pytest.raises(InfeasibleError, match=sentence) as e:
@@ -184,7 +180,7 @@ def test_no_record_on_file_beats_a_bound():
     assert count >= 3
 
 
-@published
+@needs_published
 @pytest.mark.slow  # two plans on finer meshes
 def test_the_cheapest_of_several_starts_counts_and_the_others_say_how_they_differ():
     plan = jl.plan(jl.JumpTask(0.3, 0.2), "bhr", starts=7)

@@ -6,7 +6,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from fixtures_core import jump
+from fixtures_core import on_file, refused
 from paper import certify as certificates
 from paper.certify import QUANTITIES, certificate_page, certify
 from test_store import names
@@ -24,13 +24,6 @@ WRITTEN = {"certificate.json", "certificate.html", "trials.jsonl"}
 
 def held(folder) -> set[str]:
     return set(names(folder))
-
-
-@pytest.fixture
-def folder(tmp_path):
-    plan = jump(0.6, 0.3, method="direct")
-    store.write_plan(tmp_path / "plan", plan.tape, plan.robot, plan.summary)
-    return tmp_path / "plan"
 
 
 def measured(**changed) -> Metrics:
@@ -193,8 +186,7 @@ def test_interrupted_it_goes_on(folder, physics, capsys):
 
 
 def test_what_makes_no_certificate_says_why(folder, physics, monkeypatch, capsys):
-    with pytest.raises(InputError, match=r"^n = 0 is too small; it must be at least 1$"):
-        certify(folder, 0)
+    assert refused(certify, folder, 0) == "n = 0 is too small; it must be at least 1"
     assert cli.main(["certify", str(folder), "--n", "0"]) == 2
     assert capsys.readouterr().err == "jumplab: --n must be a whole number from 1 to 100000, got '0'\n"
 
@@ -210,16 +202,13 @@ def test_what_makes_no_certificate_says_why(folder, physics, monkeypatch, capsys
     (folder / "trials.jsonl").unlink()
     monkeypatch.setitem(sys.modules, "mujoco", None)
     monkeypatch.delitem(sys.modules, "jumplab.sim.mujoco", raising=False)
-    with pytest.raises(InputError, match=r"^engine 'mujoco': the package mujoco is not installed; "):
-        certify(folder, 1, jobs=1)
+    assert refused(certify, folder, 1, jobs=1).startswith("engine 'mujoco': the package mujoco is not installed; ")
     assert held(folder) == LAID
 
 
 def test_a_new_plan_takes_the_certificate_away(folder, physics):
     certify(folder, 1, jobs=1)
-    plan = jump(0.6, 0.3, method="direct")
-    store.write_plan(folder, plan.tape, plan.robot, plan.summary)
-    assert held(folder) == LAID
+    assert held(on_file(folder)) == LAID
 
 
 def test_the_page_shows_every_quantity(folder, physics):

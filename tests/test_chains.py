@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_chains import planner, rehearsal, waiting
-from fixtures_core import jump
+from fixtures_core import jump, refused
 
 from jumplab.control.kinematics import Gauge
 from jumplab.errors import InfeasibleError, InputError, SolverError
@@ -42,39 +42,30 @@ def test_course_of_numbers():
         (([0.6, 0.6], 0.3, [0.8, -0.8]), "jump 2 of 2: platform = -1.6 m is outside -1 ... 1 m"),
         (([0.5, 0.5], 0.3, None, [0.1]), "1 sides for 2 distances: give one per jump"),
         (([0.5, 0.5], 0.3, None, None, [1.0] * 3), "3 turns for 2 distances: give one per jump"),
-        (
-            ([0.5, 0.5], 0.3, [0.1, 0.1], None, [1.0, 0.0]),
-            "platforms need a straight course; leave out the platforms, or the sides and turns",
-        ),
+        (([0.5, 0.5], 0.3, [0.1, 0.1], None, [1.0, 0.0]),
+         "platforms need a straight course; leave out the platforms, or the sides and turns"),
     ],
-)
+)  # fmt: skip
 def test_courses_that_cannot_be_meant(arguments, sentence):
-    with pytest.raises(InputError) as e:
-        Course.of(*arguments)
-    assert str(e.value) == sentence
+    assert refused(Course.of, *arguments) == sentence
 
 
 @pytest.mark.parametrize(
     ("arguments", "kind", "sentence"),
     [
-        (
-            ([0.6, 0.25], 0.3, [0.0, 0.2]), InputError,
-            "jump 2 of 2: the surface 0.2 m high would begin under the sole that stands 0.25 m before it; place them "
-            "0.34 m apart or more, toe to toe",
-        ),
-        (
-            ([0.6, -0.6], 0.3, [0.2, 0.2]), InputError,
-            "jump 2 of 2: -0.6 m goes back over the platforms; chains with platforms go forward, backward jumps stay "
-            "on the level",
-        ),
+        (([0.6, 0.25], 0.3, [0.0, 0.2]), InputError,
+         "jump 2 of 2: the surface 0.2 m high would begin under the sole that stands 0.25 m before it; place them "
+         "0.34 m apart or more, toe to toe"),
+        (([0.6, -0.6], 0.3, [0.2, 0.2]), InputError,
+         "jump 2 of 2: -0.6 m goes back over the platforms; chains with platforms go forward, backward jumps stay "
+         "on the level"),
     ],
 )  # fmt: skip
 def test_impossible_chains_are_refused_before_any_solve(monkeypatch, arguments, kind, sentence):
     """Neither planner nor simulation is asked."""
     monkeypatch.setattr(Planner, "plan", lambda *a, **k: pytest.fail("a jump was planned"))
-    with pytest.raises(kind) as e:
-        run_chain(Course.of(*arguments), Robot.load(), planner=planner())
-    assert str(e.value).startswith(sentence) and "\n" not in str(e.value)
+    said = refused(run_chain, Course.of(*arguments), Robot.load(), planner=planner(), by=kind)
+    assert said.startswith(sentence) and "\n" not in said
 
 
 def test_jump_without_a_plan_is_named_before_anything_moves(monkeypatch):
@@ -94,9 +85,7 @@ def test_jump_without_a_plan_is_named_before_anything_moves(monkeypatch):
     ],
 )
 def test_settings_that_make_no_sense(arguments, sentence):
-    with pytest.raises(InputError) as e:
-        run_chain(Course.of([0.6], 0.3), Robot.load(), planner=planner(), **arguments)
-    assert str(e.value) == sentence
+    assert refused(run_chain, Course.of([0.6], 0.3), Robot.load(), planner=planner(), **arguments) == sentence
 
 
 def test_planner_of_another_posture_is_refused():

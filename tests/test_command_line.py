@@ -11,6 +11,7 @@ import time
 
 import pytest
 from fixtures_core import jump
+from fixtures_robots import needs_published
 from test_cli import ROOT, one_sentence, run
 from test_store import names
 
@@ -18,7 +19,6 @@ from jumplab import auditing
 from jumplab.cli import common
 from jumplab.cli import main as cli
 from jumplab.io import folder as store
-from jumplab.robot_import.urdf import have_published
 
 NAMES = [work.__name__.rstrip("_") for work in cli.COMMANDS]
 
@@ -121,9 +121,8 @@ def test_a_terminal_sees_what_is_going_on(planned):
         assert (last.strip(), end) == (b"", b"")  # blanks over the line
 
 
-@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
+@needs_published
 def test_the_example_in_the_help_of_each_command_can_be_typed():
-    """`--help` ends with a line that the parser takes; all commands have one."""
     parser, count = cli.make_parser(), 0
     for name, options in common.OPTIONS.items():
         if line := options.get("example"):

@@ -7,10 +7,9 @@ import zipfile
 import mujoco
 import numpy as np
 import pytest
-from fixtures_core import jump
+from fixtures_core import jump, refused
 from scipy.spatial.transform import Rotation
 
-from jumplab.errors import InputError
 from jumplab.io import export
 from jumplab.io import folder as store
 from jumplab.io.clip import read_clips
@@ -109,22 +108,19 @@ def test_tensors_with_code_or_of_the_wrong_size_are_refused(bhr, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "bad.motion"
     path.write_bytes(torch_like(pickle.dumps({"dof_pos": Code()})))
-    with pytest.raises(InputError, match=r"bad.motion: refused, it names posix.mkdir, which could run code"):
-        read_clips(path, bhr)
+    assert "bad.motion: refused, it names posix.mkdir, which could run code" in refused(read_clips, path, bhr)
     assert not (tmp_path / "it_ran").exists()
     with zipfile.ZipFile(io.BytesIO(tensor_file({"a": CONTENT["a"]}))) as file:
         index = file.read("archive/data.pkl")
     path.write_bytes(torch_like(index, b"1234"))
-    with pytest.raises(InputError, match=r"bad.motion: not a readable clip \(ValueError\)"):
-        read_clips(path, bhr)
+    assert "bad.motion: not a readable clip (ValueError)" in refused(read_clips, path, bhr)
     with zipfile.ZipFile(io.BytesIO(tensor_file({"a": np.ones(1)}))) as file:
         index, one = file.read("archive/data.pkl"), file.read("archive/data/0")
     shape, stride = (pickle.dumps(x, protocol=2)[2:-1] for x in ((1,), (1,)))
     assert shape + stride in index
     many, still = (pickle.dumps(x, protocol=2)[2:-1] for x in ((10**10,), (0,)))
     path.write_bytes(torch_like(index.replace(shape + stride, many + still), one))  # 80 GB, of one number
-    with pytest.raises(InputError, match=r"bad.motion: not a readable clip \(ValueError\)"):
-        read_clips(path, bhr)
+    assert "bad.motion: not a readable clip (ValueError)" in refused(read_clips, path, bhr)
 
 
 # platforms

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures_core import refused
 
 import jumplab as jl
 
@@ -85,10 +86,7 @@ def test_six_lines_lead_to_a_robot_that_stands(tmp_path, monkeypatch):
 
 def test_wrong_things_are_refused_in_a_sentence(tmp_path):
     for call in (jl.audit, jl.simulate, jl.view):
-        with pytest.raises(jl.errors.InputError, match=r"must be a JumpPlan, got 'plan'"):
-            call("plan")
-    with pytest.raises(jl.errors.InputError, match="there is no folder"):
-        jl.load(tmp_path / "nothing")
-    with pytest.raises(jl.errors.InputError, match="must be a JumpPlan"):
-        jl.save(tmp_path / "out", None)
+        assert "must be a JumpPlan, got 'plan'" in refused(call, "plan", by=jl.errors.InputError)
+    assert "there is no folder" in refused(jl.load, tmp_path / "nothing", by=jl.errors.InputError)
+    assert "must be a JumpPlan" in refused(jl.save, tmp_path / "out", None, by=jl.errors.InputError)
     assert not (tmp_path / "out").exists()

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fixtures_core import jump
 from fixtures_robots import child, write
 
 from jumplab.auditing.audit import audit
@@ -13,7 +14,6 @@ from jumplab.cli.main import main
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 from jumplab.show import envelope_map
-from jumplab.stages.planner import Planner
 from jumplab.studies.envelope import BEYOND, OPEN, Cell, Envelope, envelope
 from jumplab.studies.grid import most_used
 from jumplab.task import JumpTask
@@ -29,7 +29,7 @@ def test_cells_are_plans_within_the_limits(bhr, tmp_path):
 
 def test_what_is_used_most_is_the_plans(bhr):
     """Torque at its speed, speed and friction, each worked out here once more."""
-    plan = Planner(bhr).plan(JumpTask(0.5, 0.3))
+    plan = jump(0.5, 0.3, method="direct")
     tape, shares = plan.tape, {}
     for i, name in enumerate(bhr.joint_names):
         motor, tau, rate = bhr.actuators[name], np.abs(tape.tau[:, i]), np.abs(tape.v[:, 6 + i])

@@ -201,7 +201,6 @@ def test_gravity_of_the_task_reaches_the_torques(bhr):
 
 
 def test_link_angles_come_back(bhr):
-    """to_link_angles undoes the expansion."""
     m = random_motion()
     tape = expand(m, bhr, 9.8)
     for got, name in zip(to_link_angles(bhr, tape.q, tape.v, tape.a), ("angles", "rates", "accels"), strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump
-from fixtures_robots import arm_base, held_arms, sideways, waist, write
+from fixtures_robots import arm_base, held_arms, needs_published, sideways, waist, write
 from scipy.spatial.transform import Rotation
 from test_cli import one_sentence, run
 from test_store import names
@@ -23,7 +23,7 @@ from jumplab.io.tensors import read_tensors
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED
-from jumplab.robot_import.urdf import PACKAGE, have_published, locate
+from jumplab.robot_import.urdf import PACKAGE, locate
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def flip():
 
 
 # every frame of every format in MuJoCo --------------------------------------------------------------------------
-G1 = pytest.param("g1", marks=pytest.mark.skipif(not have_published(), reason="the published robots are not installed"))
+G1 = pytest.param("g1", marks=needs_published)
 
 
 def published(name: str) -> str:
@@ -240,10 +240,9 @@ def test_the_folder_for_mujoco(name, tmp_path):
     assert np.abs(data.xpos - other.xpos).max() < 1e-6 and model.opt.gravity[2] == -9.8
 
 
+@needs_published
 def test_orders_of_a_g1():
     """As trackers count them: the left leg first, or level by level."""
-    if not have_published():
-        pytest.skip("the published robots are not installed")
     whole = Whole(Robot.load("g1"))
     legs = [f"{side}_{joint}_joint" for side in ("left", "right") for joint in
             ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")]  # fmt: skip

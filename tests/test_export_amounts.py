@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import refused
 from scipy.spatial.transform import Rotation
 
 from jumplab.cli.common import CHOICES
@@ -44,12 +45,6 @@ def short() -> Motion:
 ROWS = [*range(SWITCH), *range(SWITCH + 1, LAST)]  # on a grid of 1 ms: take-off once, the later sample; no half ones
 WHOLE = Whole(ROBOT)
 AT = [JOINTS.index(name) for name in WHOLE.joints]  # of the joints in the URDF's order, in Pinocchio's
-
-
-def refused(call) -> str:
-    with pytest.raises(InputError) as e:
-        call()
-    return str(e.value)
 
 
 def frames(rate: float, motion: Motion | None = None):
@@ -136,11 +131,11 @@ def test_files_and_their_names(tmp_path):
     assert {k: export.default_name(k, "plan") for k in export.FORMATS} == NAMES
     assert {k: export.default_name(k, "simulation") for k in NAMES} == {k: f"simulated_{x}" for k, x in NAMES.items()}
     assert CHOICES["formats"] == list(NAMES) == list(export.FORMATS)
-    assert refused(lambda: export.write("bvh", short(), ROBOT, tmp_path / "x")) == (
+    assert refused(export.write, "bvh", short(), ROBOT, tmp_path / "x") == (
         f"format 'bvh': must be one of {', '.join(NAMES)}"
     )
     for name, ending in (("csv", ".csv"), ("gmr-pkl", ".pkl"), ("mjlab-npz", ".npz")):
-        assert refused(lambda name=name: export.write(name, short(), ROBOT, tmp_path / "x.txt")) == (
+        assert refused(export.write, name, short(), ROBOT, tmp_path / "x.txt") == (
             f"--out must name a file that ends in {ending}, got {str(tmp_path / 'x.txt')!r}"
         )
     path = export.write("csv", short(), ROBOT, str(tmp_path / "LOUD.CSV"))
@@ -202,7 +197,7 @@ def test_the_folder_of_a_replay(tmp_path):
     assert "simulation" not in (folder / "README.md").read_text()
     for name in ("thesis.tex", "notes.txt"):
         (folder / name).write_text("mine")
-    assert refused(lambda: export.write("urdf-replay", short(), ROBOT, folder)) == (
+    assert refused(export.write, "urdf-replay", short(), ROBOT, folder) == (
         f"the folder {str(folder)!r} already holds 'notes.txt'; choose a new or an empty one"
     )
 
@@ -230,9 +225,7 @@ def test_between_samples():
     assert motion.at([0.5205 + 0.9e-9]).tau[0] == pytest.approx(motion.tau[-1])
     for outside in ([0.4999, 0.51], [0.51, 0.5205 + 2e-9]):
         first, last = (f"{x:g}" for x in outside)
-        assert refused(lambda times=outside: motion.at(times)) == (
-            f"times {first} ... {last} s are outside the motion, 0.5 ... 0.5205 s"
-        )
+        assert refused(motion.at, outside) == (f"times {first} ... {last} s are outside the motion, 0.5 ... 0.5205 s")
 
 
 def test_the_end_may_stand_twice():
@@ -252,11 +245,9 @@ def test_grids():
     rounded = replace(motion, t=np.append(motion.t[:-1], 0.5205 - 1e-10))
     assert rounded.every(2000.0).t[-1] == rounded.t[-1]
     for rate in (np.nan, np.inf):
-        assert refused(lambda rate=rate: motion.every(rate)) == f"rate_hz must be finite, got {rate:g}"
+        assert refused(motion.every, rate) == f"rate_hz must be finite, got {rate:g}"
     for rate in (0.0, -1.0, 10_000.1):
-        assert refused(lambda rate=rate: motion.every(rate)) == (
-            f"rate = {rate:g} per second must lie above 0 and not above 10000"
-        )
+        assert refused(motion.every, rate) == (f"rate = {rate:g} per second must lie above 0 and not above 10000")
 
 
 def test_signs_of_quaternions():
@@ -283,7 +274,7 @@ def test_where_a_motion_comes_from(tmp_path):
     assert Motion.of(record).wrench is wrench
     pressing = [[phase != "flight"] * 2 for phase in ("launch",) * 11 + ("flight",) * 8 + ("landing",) * 4]
     assert Motion.of(record).contact.tolist() == pressing
-    assert refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT)) == (
+    assert refused(Motion.of_simulation_file, tmp_path, ROBOT) == (
         f"{str(tmp_path)!r} holds no simulation; run 'jumplab simulate {tmp_path}' first"
     )
     good = {k: getattr(short(), k) for k in ("t", "q", "v", "tau", "phase")}
@@ -303,14 +294,14 @@ def test_where_a_motion_comes_from(tmp_path):
              "schema": np.array("x"), "joint_names": good["joint_names"][::-1], "t": good["t"][None]}  # fmt: skip
     for name, value in wrong.items():
         np.savez(path, **(good | {name: value}))
-        assert refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT)) == foreign
+        assert refused(Motion.of_simulation_file, tmp_path, ROBOT) == foreign
     np.savez(path, **{k: x for k, x in good.items() if k != "tau"})
-    assert refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT)) == (
+    assert refused(Motion.of_simulation_file, tmp_path, ROBOT) == (
         f"{path}: not a readable simulation (KeyError); simulate the plan again"
     )
     np.savez(path, **(good | {"t": good["t"].astype(object)}))
-    assert "not a readable simulation (ValueError)" in refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT))
+    assert "not a readable simulation (ValueError)" in refused(Motion.of_simulation_file, tmp_path, ROBOT)
     path.write_bytes(path.read_bytes()[:200])
-    assert "not a readable simulation" in refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT))
+    assert "not a readable simulation" in refused(Motion.of_simulation_file, tmp_path, ROBOT)
     with pytest.raises(AttributeError):
         back.source = "plan"

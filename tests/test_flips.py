@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import planner
 from paper.drawings import trunk_angle
 from paper.planar import planar_quantities
 
@@ -18,7 +19,6 @@ from jumplab.errors import InputError, SolverError
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S, Perturbation, Ranges, simulate_jump
 from jumplab.stages.joint_qp import map_to_joints
-from jumplab.stages.planner import Planner
 from jumplab.stages.reconstruction import to_link_angles
 from jumplab.stages.whole_body import Limits, Mesh, Weights, WholeBodyPlanner, motions
 from jumplab.stages.whole_body.body import Body
@@ -31,11 +31,6 @@ from jumplab.task import JumpTask
 
 TURN = 2 * np.pi
 STANCE_PITCH_RAD = 0.05  # of the trunk
-
-
-@lru_cache
-def planner():
-    return Planner(Robot.load())
 
 
 @lru_cache
@@ -177,7 +172,6 @@ def test_tuck_forecasts_the_attitude_about_all_axes():
 
 @pytest.mark.slow
 def test_a_rolled_and_yawed_flip_meets_the_ground_with_flat_soles():
-    """Its trunk comes down rolled and yawed, and its soles do not."""
     plan = backflip()
     drawn = Perturbation.draw(plan.robot, TrialKey(0, 9, "", "").robot_seed)
     result = simulate_jump(plan.tape, plan.robot, perturbation=drawn, reaim=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump, slopes
+from fixtures_robots import needs_published
 from scipy.linalg import solve_discrete_are
 
 import jumplab as jl
@@ -16,7 +17,6 @@ from jumplab.io.motion import Motion
 from jumplab.io.whole import Whole
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.robot_import.urdf import have_published
 
 WHOLE = Whole(Robot.load())
 MODEL = WHOLE.model
@@ -109,10 +109,8 @@ def test_gains_count_for_the_errors_of_mujoco(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bhr", "g1_arms"])
+@pytest.mark.parametrize("name", ["bhr", pytest.param("g1_arms", marks=needs_published)])
 def test_the_player_stands_with_its_gains_and_falls_without(name, tmp_path):
-    if name != "bhr" and not have_published():
-        pytest.skip("the published robots are not installed")
     plan = jump(0.4, 0.2, method="direct") if name == "bhr" else jl.plan(jl.JumpTask(0.4, 0.2), name)
     run = jl.simulate(plan)
     folder = export.write("mujoco", Motion.of(run), plan.robot, tmp_path / "mujoco")

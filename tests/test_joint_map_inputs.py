@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fixtures_core import pendulum
+from fixtures_core import pendulum, refused
 from paper.joint_qp_printed import Form
 from paper.joint_qp_studies import CvxpySolver
 from paper.joint_violations import joint_violations
@@ -20,8 +20,7 @@ from jumplab.stages.joint_qp.words import checked
 
 
 def test_another_thing_than_a_plan_of_stage_one():
-    with pytest.raises(InputError, match="stage 1's plan must be a SrmpPlan, got namespace"):
-        map_to_joints(SimpleNamespace(), Robot.load())
+    assert "stage 1's plan must be a SrmpPlan, got namespace" in refused(map_to_joints, SimpleNamespace(), Robot.load())
 
 
 @pytest.mark.parametrize("step", [0.0, -0.01, 0.1, float("nan"), "fast", None])
@@ -31,10 +30,8 @@ def test_bad_step(step):
 
 
 def test_unknown_words():
-    with pytest.raises(InputError, match=r"form: heel = 'never', must be one of"):
-        Form(heel="never")
-    with pytest.raises(InputError, match=r"q0 has shape \(3,\)"):
-        map_to_joints(pendulum(1.0, 0.5), Robot.load(), q0=np.zeros(3))
+    assert "form: heel = 'never', must be one of" in refused(Form, heel="never")
+    assert "q0 has shape (3,)" in refused(map_to_joints, pendulum(1.0, 0.5), Robot.load(), q0=np.zeros(3))
 
 
 def test_hopeless_limits_name_phase_time_and_rows():

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import refused
 from paper.joint_qp_studies import CvxpySolver
 
 import jumplab as jl
@@ -186,7 +187,6 @@ def test_the_middle_of_the_step_is_a_terms_time():
 
 @pytest.mark.parametrize("phase", TERMS)
 def test_every_term_has_a_row_in_the_table(phase):
-    """The table has the blocks that the QPs have."""
     mapper = JointMapper(stage1(), jl.Robot.load())
     program = mapper.step(qp_of(phase, mapper), 0, plain().state(plain().rows(phase).start))[2]
     rows = {r["name"]: r for r in mapper.problem.table() if r["phase"] == phase}
@@ -298,6 +298,4 @@ REFUSED = [
 @pytest.mark.parametrize(("changes", "sentence"), REFUSED)
 def test_refused_in_a_sentence_before_any_solve(changes, sentence, monkeypatch):
     monkeypatch.setattr(JointMapper, "run", lambda *_: pytest.fail("solved"))
-    with pytest.raises(jl.errors.InputError) as e:
-        mapped(**changes)
-    assert str(e.value) == sentence
+    assert refused(mapped, **changes, by=jl.errors.InputError) == sentence

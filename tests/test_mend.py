@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from test_judge import CLIPS, NO_ROBOTS, standing
+from fixtures_robots import needs_published
+from test_judge import CLIPS, standing
 
 import jumplab as jl
 from jumplab.cli.main import main
@@ -18,7 +19,6 @@ from jumplab.io import export
 from jumplab.io.motion import Motion
 from jumplab.ocp.nlp import RESIDUAL_LIMIT
 from jumplab.robot import Robot
-from jumplab.stages.plan import JumpPlan
 from jumplab.stages.whole_body import Limits, Weights
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.mode import Mode
@@ -84,7 +84,7 @@ def test_the_cut_is_where_the_joints_are_quiet():
     assert 2.0 - begin == pytest.approx(0.93, abs=0.02) and end - lands == pytest.approx(AROUND_S[0], abs=0.02)
 
 
-@NO_ROBOTS
+@needs_published
 def test_a_stance_too_wide_for_flat_soles_is_refused():
     clip = jl.judge(CLIPS / "side_jump_level2.pkl", "g1").clip
     q = clip.q.copy()
@@ -103,7 +103,7 @@ def test_a_clip_that_never_stands_is_refused():
 GOAL = jl.JumpTask(0.6, 0.15, side_m=0.1, yaw_rad=0.3)
 
 
-@NO_ROBOTS
+@needs_published
 def test_a_clip_that_is_followed_to_a_target_lands_there():
     report = jl.judge(CLIPS / "jump_forward_level2.pkl", "g1")
     usual, moved = Draft(report), Draft(report, goal=GOAL)
@@ -115,7 +115,7 @@ def test_a_clip_that_is_followed_to_a_target_lands_there():
     np.testing.assert_allclose(moved.motion.charts[0], usual.motion.charts[0], atol=1e-9)  # the launch is the clip's
 
 
-@NO_ROBOTS
+@needs_published
 def test_what_no_clip_shows_is_refused():
     with pytest.raises(InputError, match="like a clip needs level ground and no flip"):
         jl.plan(jl.JumpTask(0.5, 0.3, platform_m=0.1), "g1", like=CLIPS / "jump_forward_level2.pkl")
@@ -125,7 +125,7 @@ def test_what_no_clip_shows_is_refused():
         jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl", method="three-step")
 
 
-@NO_ROBOTS
+@needs_published
 def test_waist_and_arms_stay_near_what_is_followed():
     body = Body(Robot.load("g1"))
     mode = Mode(body, Limits().of_clip(), Weights().of_clip(), "LR")
@@ -137,14 +137,14 @@ def test_waist_and_arms_stay_near_what_is_followed():
         assert off == pytest.approx((clip - near)[body.upper]) and term.weight == 15.0 and len(off)
 
 
-@NO_ROBOTS
+@needs_published
 def test_the_command_plans_in_the_manner_of_a_clip(tmp_path, capsys):
     clip = str(CLIPS / "side_jump_level2.pkl")
     assert main(["plan", "--robot", "g1", "--like", clip, "--out", str(tmp_path)]) == 2
     assert "its contacts are LR R r - L LR" in capsys.readouterr().err
 
 
-@NO_ROBOTS
+@needs_published
 @pytest.mark.slow
 def test_a_jump_to_a_target_in_the_manner_of_a_clip():
     plan = jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl")
@@ -155,7 +155,7 @@ def test_a_jump_to_a_target_in_the_manner_of_a_clip():
     assert jl.audit(plan).passed
 
 
-@NO_ROBOTS
+@needs_published
 @pytest.mark.slow
 def test_feet_that_carry_little_after_a_landing_need_no_finer_mesh():
     # it hops up again 0.3 s after touchdown: what the landing moved the base by must not come back there
@@ -164,20 +164,26 @@ def test_feet_that_carry_little_after_a_landing_need_no_finer_mesh():
     assert plan.whole_body.used < 1 and jl.audit(plan).passed
 
 
-@NO_ROBOTS
+@pytest.fixture(scope="module")
+def mended():
+    return jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
+
+
+@needs_published
 @pytest.mark.slow
-def test_a_nearest_motion_that_fails_its_audit_is_none(monkeypatch):
+def test_a_nearest_motion_that_fails_its_audit_is_none(mended, monkeypatch):
+    audit = SimpleNamespace(failed=[SimpleNamespace(name="base residual")])
+    plan = SimpleNamespace(audit=audit, whole_body=mended.plan.whole_body)
     monkeypatch.setattr(study, "FACTORS", (0.8,))
-    monkeypatch.setattr(JumpPlan, "audit", SimpleNamespace(failed=[SimpleNamespace(name="base residual")]))
+    monkeypatch.setattr(study.Planner, "follow", lambda *_, **how: plan)
     sentence = r"the nearest motion fails its audit \(base residual\), pressed by .+; nor can it with 0\.8 of"
     with pytest.raises(InfeasibleError, match=sentence):
-        jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
+        jl.mend(mended.before)
 
 
-@NO_ROBOTS
+@needs_published
 @pytest.mark.slow
-def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
-    mended = jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
+def test_a_public_clip_is_mended_audited_and_stands(mended, tmp_path):
     rows = {row["what"]: row for row in mended.changes}
     assert jl.audit(mended.plan).passed and not mended.before.passed
     for fps in (50, 100):

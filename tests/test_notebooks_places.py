@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 from paper import running
-from test_notebooks import RECORD, make_notebook, names, wait_for
+from test_notebooks import RECORD, make_notebook, wait_for
+from test_store import names
 
 from jumplab.cli import notebooks
 

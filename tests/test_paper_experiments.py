@@ -6,13 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fixtures_core import jump
 from matplotlib.colors import to_hex
-from matplotlib.text import Text
 from paper import experiments as pictures
 from paper import worlds
 from paper.basin import BasinGrid, BasinReport
 from paper.measurement import measure
+from test_show_simulations import smallest_font
 
 from jumplab.show.style import GROUND, LANDING, MIN_FONT_PT, PAGE_IN, VERMILION, tint
 from jumplab.sim import ENGINES, Engine, Scene, SensorNoise, simulate_jump
@@ -23,23 +22,14 @@ SHORT_S = 0.3  # of standing: enough for a picture
 
 
 @pytest.fixture(scope="module")
-def tape():
-    return jump(1.0, 0.5).tape
-
-
-@pytest.fixture(scope="module")
-def result(tape, bhr):
-    return simulate_jump(tape, bhr, scene=DITCH, stand_s=SHORT_S)
+def result(good, bhr):
+    return simulate_jump(good, bhr, scene=DITCH, stand_s=SHORT_S)
 
 
 @pytest.fixture(autouse=True)
 def no_simulation(result, monkeypatch):
     """No picture may simulate."""
     monkeypatch.setattr(Engine, "__init__", None)
-
-
-def smallest_font(fig) -> float:
-    return min(t.get_fontsize() for t in fig.findobj(Text) if t.get_text() and t.get_visible())
 
 
 def grounds(fig):
@@ -90,7 +80,7 @@ def test_rendered_frames_name_their_experiment(result, bhr):
 # ------------------------------------------------------------------------------------------ sensors
 
 
-def test_exact_sensors_tell_the_truth(result, bhr, tape):
+def test_exact_sensors_tell_the_truth(result, bhr, good):
     """Without noise and with the right model: L and rho to rounding, the CoM to what a step of 1 ms leaves open."""
     exact = measure(result, bhr, SensorNoise())
     n = len(exact.t)
@@ -99,7 +89,7 @@ def test_exact_sensors_tell_the_truth(result, bhr, tape):
     assert exact.L == pytest.approx(result.L[:n], abs=5e-8)  # the spin that is estimated is off by 2e-9 rad/s
     # half a step of 1 ms at the CoM's speed changes in launch, up to 40 m/s^2 for tenths of a second
     assert np.abs(exact.com - result.com[:n][:, [0, 2]]).max() < 4e-4
-    fig = pictures.measured_jump(exact, tape, bhr)
+    fig = pictures.measured_jump(exact, good, bhr)
     assert len(fig.axes) == 4 and smallest_font(fig) >= MIN_FONT_PT
     shown = np.concatenate([line.get_ydata() for line in fig.axes[3].lines[:2]])
     assert shown == pytest.approx(exact.rho)

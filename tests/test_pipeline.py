@@ -6,10 +6,9 @@ from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
-from fixtures_core import jump, planner
+from fixtures_core import jump, planner, refused
 
-from jumplab.errors import InputError, SolverError
-from jumplab.io.tape import Tape
+from jumplab.errors import SolverError
 from jumplab.ocp.nlp import GOOD_STATUSES
 from jumplab.robot import Robot
 from jumplab.stages import planner as pipeline
@@ -18,11 +17,6 @@ from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.stages.whole_body import WholeBodyPlanner, motions
 from jumplab.task import JumpTask
-
-
-@pytest.fixture(scope="module")
-def plan():
-    return jump(1.0, 0.5)
 
 
 @pytest.mark.slow
@@ -46,7 +40,7 @@ def test_planned_numbers_are_the_tapes(plan):
     assert plan.planned_rise_m == pytest.approx(v * v / (2 * 9.8), abs=1e-4)
 
 
-def test_tape_fits_the_robot_and_the_file(plan, tmp_path):
+def test_tape_fits_the_robot(plan):
     tape, robot = plan.tape, plan.robot
     n = len(tape.t)
     shapes = {"q": (n, 21), "v": (n, 20), "a": (n, 20), "tau": (n, 14), "f": (n, 2, 6), "phase": (n,)}
@@ -54,10 +48,6 @@ def test_tape_fits_the_robot_and_the_file(plan, tmp_path):
     assert tuple(tape.joint_names) == robot.joint_names and tuple(tape.contact_frames) == robot.foot.frames
     assert list(dict.fromkeys(tape.phase)) == ["launch", "flight"]
     assert all(np.all(np.isfinite(x)) for x in tape.arrays().values() if x.dtype.kind == "f")
-    tape.save(tmp_path / "plan.npz")
-    back = Tape.load(tmp_path / "plan.npz")
-    for name, x in tape.arrays().items():
-        np.testing.assert_array_equal(x, back.arrays()[name])
 
 
 def test_tape_carries_stage_one_under_its_own_name(plan):
@@ -70,18 +60,10 @@ def test_tape_carries_stage_one_under_its_own_name(plan):
 
 def test_summary_is_plain_and_true(plan):
     summary = json.loads(json.dumps(plan.summary))
-    assert summary["target"] == {
-        "distance_m": 1.0,
-        "height_m": 0.5,
-        "platform_m": 0.0,
-        "rotation_rad": 0.0,
-        "gravity": 9.8,
-        "side_m": 0.0,
-        "yaw_rad": 0.0,
-    }
-    assert summary["robot"]["hash"] == plan.robot.hash == Robot.load().hash and summary["robot"][
-        "mass_kg"
-    ] == pytest.approx(42.0)
+    zeros = dict.fromkeys(("platform_m", "rotation_rad", "side_m", "yaw_rad"), 0.0)
+    assert summary["target"] == {"distance_m": 1.0, "height_m": 0.5, "gravity": 9.8} | zeros
+    assert summary["robot"]["hash"] == plan.robot.hash == Robot.load().hash
+    assert summary["robot"]["mass_kg"] == pytest.approx(42.0)
     assert summary["planned_distance_m"] == plan.planned_distance_m
     assert summary["launch_s"] + summary["flight_s"] == pytest.approx(plan.tape.t[-1], abs=1.1e-3)
     for i, name in enumerate(plan.tape.joint_names):
@@ -114,9 +96,8 @@ def test_inertia_is_shaped_in_flight(plan):  # N-16
 
 @pytest.mark.parametrize("method", ["", "two-step", "Direct"])
 def test_unknown_method(method):
-    with pytest.raises(InputError) as e:
-        Planner(Robot.load()).plan(JumpTask(1.0, 0.5), method)
-    assert str(e.value) == f"method {method!r}: choose one of three-step, direct"
+    said = refused(Planner(Robot.load()).plan, JumpTask(1.0, 0.5), method)
+    assert said == f"method {method!r}: choose one of three-step, direct"
 
 
 def failing(error: Exception):
@@ -187,11 +168,3 @@ def test_manifest_says_how_the_plan_came_about(method):
         assert told["iterations"] > 0 and 0 <= told["residual"] < 1e-4
         assert name == "joint map" or (told["status"] in GOOD_STATUSES and told["variables"] > 100)
     assert found["seeds"].startswith("none")
-
-
-@pytest.mark.slow
-def test_refusal_of_stage_one_names_what_it_misses():
-    """Two metres at half a metre of rise pass the closed forms, but not the optimisation."""
-    said = r"^SRMP: no plan .* by [\d.]+ m/s at t = .*"
-    with pytest.raises(SolverError, match=said):
-        planner().plan(JumpTask(2.0, 0.5), "three-step")

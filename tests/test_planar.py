@@ -7,8 +7,6 @@ from fixtures_core import chain_motion
 from paper.lagrange import five_links
 from paper.planar import PlanarState, evaluator, symbols
 
-from jumplab.robot.stance import stance_angles
-
 STEP = 1e-5
 
 
@@ -28,13 +26,8 @@ def random_states(count, seed=0):
         yield rng.uniform(-1.5, 1.5, 5), rng.normal(scale=4, size=5), rng.normal(scale=30, size=5)
 
 
-PAIRS = [
-    ("com", "com_velocity"),
-    ("com_velocity", "com_acceleration"),
-    ("L", "L_rate"),
-    ("rho", "rho_rate"),
-    ("joints", "joint_rates"),
-]
+PAIRS = [("com", "com_velocity"), ("com_velocity", "com_acceleration"), ("L", "L_rate"), ("rho", "rho_rate"),
+         ("joints", "joint_rates")]  # fmt: skip
 
 
 @pytest.mark.parametrize("quantity, rate", PAIRS)
@@ -56,15 +49,6 @@ def test_points_and_their_derivatives(bhr, name):
             np.testing.assert_allclose(got.full().ravel(), want, atol=1e-11)
 
 
-def test_rigid_turn_has_momentum_rho_w(planar):
-    """All links turning together: L = rho w, and rho does not change."""
-    for q, _, _ in random_states(3, seed=2):
-        out = at(planar, q, np.full(5, 2.0), np.zeros(5))
-        assert out["L"][0] == pytest.approx(2.0 * out["rho"][0], rel=1e-12)
-        assert out["rho_rate"][0] == pytest.approx(0, abs=1e-9)
-        np.testing.assert_allclose(out["joint_rates"], 0, atol=1e-12)
-
-
 def test_against_lagrange(bhr, planar):
     """M theta'' + H = S tau + J' F of the paper's coordinates, from the toe-rooted recursion."""
     s, second = bhr.sagittal, five_links(bhr.sagittal)
@@ -83,29 +67,3 @@ def test_against_lagrange(bhr, planar):
         hip_t, knee_t, ankle_t, shoulder_t = out["torques"]
         want = [*force, about[0], hip_t + about[0], knee_t + about[1], ankle_t + about[2], shoulder_t]
         np.testing.assert_allclose(left, want, atol=1e-8)
-
-
-def test_flight_without_torque_on_the_whole(bhr, planar):
-    """With the toe falling so that the CoM falls freely, the torques are those of a robot that nothing touches."""
-    s, second = bhr.sagittal, five_links(bhr.sagittal)
-    q, v, a = next(random_states(1, seed=8))
-    inertia = at(planar, q, v, np.eye(5)[4])["L_rate"] - at(planar, q, v, np.zeros(5))["L_rate"]
-    a[4] -= at(planar, q, v, a)["L_rate"][0] / inertia[0]  # the arm swings so that L is constant
-    out = at(planar, q, v, a)
-    assert out["L_rate"][0] == pytest.approx(0, abs=1e-9)
-    jolt = -out["com_acceleration"] - [0, 9.8]
-    torques = at(planar, q, v, a, jolt)["torques"]
-    hip, hip_v, hip_a = chain_motion(s.span[:3], q[:3], v[:3], a[:3])
-    theta, rate, accel = (
-        np.array([*h, x[3], *s.joint_angles(x)]) for h, x in ((hip, q), (hip_v, v), (hip_a + jolt, a))
-    )
-    left = second(theta, rate, accel).full().ravel()
-    np.testing.assert_allclose(left[:3], 0, atol=1e-8)
-    np.testing.assert_allclose(left[3:], torques, atol=1e-8)
-
-
-def test_gravity_is_an_argument(bhr):
-    q, zero = stance_angles(bhr), np.zeros(5)
-    moon = at(evaluator(bhr.sagittal, 1.62), q, zero, zero)
-    assert moon["ground_wrench"][1] == pytest.approx(42.0 * 1.62)
-    np.testing.assert_allclose(moon["torques"] / 1.62, at(evaluator(bhr.sagittal), q, zero, zero)["torques"] / 9.8)

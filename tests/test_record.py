@@ -6,13 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from fixtures_robots import needs_published
 
 import jumplab as jl
 from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.ocp import Bound, Nlp, Phase, PhaseGuess, Problem, Term
 from jumplab.ocp.nlp import patience
-from jumplab.robot_import.urdf import have_published
 from jumplab.show import price_bars
 from jumplab.studies import record as study
 
@@ -95,7 +95,7 @@ def test_a_robot_without_an_easy_jump_has_no_record(bhr):
         jl.record(bhr.with_limits(effort=0.1), "height_m", engines=())
 
 
-@pytest.mark.skipif(not have_published(), reason="needs the published robots")
+@needs_published
 @pytest.mark.parametrize(("robot", "what", "least"), [("alexander", "height_m", 0.23), ("talos", "platform_m", 0.055)])
 def test_a_record_passes_its_audit_near_the_largest_number_at_the_nodes(robot, what, least):
     """Alexander would lay its trunk on the ground; a finer mesh alone leads Talos to less than a third."""

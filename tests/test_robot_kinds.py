@@ -244,23 +244,18 @@ def rods(text: str, motor: str, equality: str) -> str:
 CRANK = '<motor joint="{side}_crank" ctrlrange="-90 90"/>'
 
 
-def test_a_knee_that_a_closed_chain_moves_needs_its_effort(put):
-    tie = '<connect name="{side}_bar" body1="{side}_rod" body2="{side}_knee_link" anchor="0 0 -.31"/>'
+@pytest.mark.parametrize(("tie", "said"), [
+    ('<connect name="{side}_bar" body1="{side}_rod" body2="{side}_knee_link" anchor="0 0 -.31"/>',
+     "the joints 'left_crank', 'left_knee' of this closed chain move as if it were cut"),
+    ('<joint joint1="{side}_knee" joint2="{side}_crank" polycoef="0 .5 .3 0 0"/>',
+     "couples the joints 'left_knee', 'left_crank' along a curve: left out, they move as if it"),
+], ids=["closed chain", "curve"])  # fmt: skip
+def test_a_knee_that_is_moved_by_another_joint_needs_its_effort(put, tie, said):
     path = put(rods(MJCF, CRANK, tie), "a.xml")
     found = draft(path)
-    assert found.roles.joints["knee"] == ("left_knee", "right_knee")
-    assert "the joints 'left_crank', 'left_knee' of this closed chain move as if it were cut" in notes(path)
-    assert sum("give effort, velocity in [limits.left_knee]" in sentence for sentence in found.faults) == 1
-    given = TOLD.replace("[limits.knee]", "[limits.knee]\neffort = 120.0")
-    assert check(path, found.text + given).robot.actuators["left_knee"]["effort"] == 120
-
-
-def test_a_knee_moved_along_a_curve_needs_its_effort(put):
-    tie = '<joint joint1="{side}_knee" joint2="{side}_crank" polycoef="0 .5 .3 0 0"/>'
-    path = put(rods(MJCF, CRANK, tie), "a.xml")
-    found = draft(path)
-    assert found.roles.joints["knee"] == ("left_knee", "right_knee")
-    assert "couples the joints 'left_knee', 'left_crank' along a curve: left out, they move as if it" in notes(path)
+    assert found.roles.joints["knee"] == ("left_knee", "right_knee") and said in notes(path)
+    if "connect" in tie:
+        assert sum("give effort, velocity in [limits.left_knee]" in sentence for sentence in found.faults) == 1
     given = TOLD.replace("[limits.knee]", "[limits.knee]\neffort = 120.0")
     assert check(path, found.text + given).robot.actuators["left_knee"]["effort"] == 120
 
@@ -447,10 +442,14 @@ def test_an_origin_may_lie_anywhere_on_its_axis(put):
         text = _shifted(text, rf'<joint name="{joint}" .*?</joint>', shift)
         text = _shifted(text, rf'<link name="{link}">.*?</link>', -shift)
         text = _shifted(text, rf'<joint name="{below}" .*?</joint>', -shift) if below else text
-    plain, moved = (examine(put(x)).robot for x in (URDF, text))
-    assert moved.planar and moved.foot.heel == pytest.approx(plain.foot.heel)
+    same_robot(put, text)
+
+
+def same_robot(put, moved: str) -> None:
+    plain, other = (examine(put(x)).robot for x in (URDF, moved))
+    assert other.planar and other.foot.heel == pytest.approx(plain.foot.heel)
     for name in ("mass", "inertia", "com", "span", "heel"):
-        np.testing.assert_allclose(getattr(moved.sagittal, name), getattr(plain.sagittal, name), atol=1e-9)
+        np.testing.assert_allclose(getattr(other.sagittal, name), getattr(plain.sagittal, name), atol=1e-9)
 
 
 def _shifted(text: str, pattern: str, shift: np.ndarray) -> str:
@@ -522,11 +521,8 @@ def test_origins_moved_to_one_side_along_their_axes_are_the_same_robot(put):
         roll = f'<child link="{side}_hip_roll_link"/><origin xyz="0 {{}} 0"'
         pairs = [(text.format(0), text.format(-0.02)) for text in (link, roll)]
         moved = changed(moved, *pairs, (hip.format(y), hip.format(y + 0.02)))
-    robot = examine(put(moved)).robot
-    same = examine(put(URDF)).robot
-    assert robot.planar and robot.foot == same.foot
-    for name in ("mass", "inertia", "com", "span"):
-        np.testing.assert_allclose(getattr(robot.sagittal, name), getattr(same.sagittal, name), atol=1e-9)
+    same_robot(put, moved)
+    assert examine(put(moved)).robot.foot == examine(put(URDF)).robot.foot
 
 
 def test_unlike_ranges_are_named_and_mended_as_advised(put):

@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
+from fixtures_core import jump, planner
+from fixtures_robots import needs_published
 from paper.margins import ranges_at
 
 import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.models.spatial import SpatialModel
 from jumplab.ocp.problem import Point
-from jumplab.robot_import.urdf import have_published
 from jumplab.sim import Perturbation, Ranges, Scene, simulate_jump
 from jumplab.stages.changes import settled
 from jumplab.stages.planner import Planner
@@ -27,13 +28,13 @@ TASK = jl.JumpTask(1.0, 0.5)
 
 @pytest.fixture(scope="module")
 def plans(bhr):
-    return jl.plan(TASK, bhr), jl.plan(TASK, bhr, robust=Ranges())
+    return jump(1.0, 0.5, method="direct"), jl.plan(TASK, bhr, robust=Ranges())
 
 
 @pytest.fixture(scope="module")
 def sideways(bhr):
     task = jl.JumpTask(0.2, 0.3, side_m=0.2)
-    return jl.plan(task, bhr), jl.plan(task, bhr, robust=Ranges())
+    return planner().plan(task), jl.plan(task, bhr, robust=Ranges())
 
 
 def ends_of(plan, model):
@@ -90,7 +91,7 @@ def test_a_robust_plan_brings_sampled_robots_to_rest_nearer_to_the_middle(bhr, p
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
+@needs_published
 def test_a_robot_of_many_joints_has_robust_plans(monkeypatch):
     monkeypatch.setattr(robust, "SAMPLES", 2)  # trees of many joints take long to differentiate
     task, g1 = jl.JumpTask(0.2, 0.15), jl.Robot.load("g1_arms")

@@ -15,22 +15,22 @@ import matplotlib.image
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump
+from fixtures_core import jump, on_file, refused
+from fixtures_robots import needs_published
 from scipy.spatial import cKDTree
 from test_cli import one_sentence, run
 from test_store import names
 
-from jumplab.errors import InputError
 from jumplab.io import folder as store
 from jumplab.io.motion import Motion
 from jumplab.robot import Robot
 from jumplab.robot.files import files_of
 from jumplab.robot_import.checkup import examine
-from jumplab.robot_import.urdf import have_published, locate
+from jumplab.robot_import.urdf import locate
 from jumplab.show import shapes
 from jumplab.show import viewer as viewer
 from jumplab.show.style import PHASE_COLORS
-from jumplab.sim import Scene, simulate_jump
+from jumplab.sim import Scene
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
@@ -39,14 +39,7 @@ FLAGS = (
     "--window-size=1280,720 --virtual-time-budget=4000 --enable-logging=stderr"
 ).split()
 STAGE = slice(64, 555)  # rows of a picture between the header and the curves
-published = pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
-
-
-@pytest.fixture(scope="module")
-def simulation():
-    p = jump(1.0, 0.5)
-    return simulate_jump(p.tape, p.robot)
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +178,7 @@ def test_rounded_body_stands_on_the_soles_between_the_joints(bhr):
         assert np.einsum("ij,ij->i", a, np.cross(b, c)).min() > -1e-12
 
 
-@published
+@needs_published
 @pytest.mark.parametrize("name", ["g1_legs", "talos"])
 def test_meshes_of_a_published_robot_lie_where_its_urdf_puts_them(name):
     """Pinocchio places the same meshes by the published URDF: all fill the same space, but for the coarseness."""
@@ -213,7 +206,7 @@ def test_meshes_of_a_published_robot_lie_where_its_urdf_puts_them(name):
     assert max(away) < 0.02, away  # no point is missing, none is elsewhere
 
 
-@published
+@needs_published
 def test_without_the_files_a_published_robot_is_drawn_from_boxes_and_the_page_says_so(monkeypatch):
     robot = Robot.load("g1_legs")
     monkeypatch.setattr("jumplab.robot_import.urdf.have_published", lambda: False)
@@ -251,16 +244,13 @@ def test_robot_whose_shapes_are_lost_keeps_its_limbs(bhr):
 
 
 def test_nothing_to_show(bhr):
-    with pytest.raises(InputError, match=r"^a page needs a plan or a simulation to show$"):
-        viewer.page(bhr)
+    assert refused(viewer.page, bhr) == "a page needs a plan or a simulation to show"
 
 
 # the command ----------------------------------------------------------------------------------------------------
 @pytest.fixture
 def plan(tmp_path):
-    p = jump(1.0, 0.5)
-    store.write_plan(tmp_path / "plan", p.tape, p.robot, p.summary)
-    return tmp_path / "plan"
+    return on_file(tmp_path / "plan", jump(1.0, 0.5))
 
 
 def test_command(capsys, plan, odd_folder, simulation):

@@ -9,13 +9,13 @@ import matplotlib.image
 import numpy as np
 import pytest
 from fixtures_core import jump
-from test_show_page import CHROMIUM, FLAGS, STAGE, browser, count, published
+from fixtures_robots import needs_published
+from test_show_page import CHROMIUM, FLAGS, STAGE, browser, count
 
 import jumplab as jl
 from jumplab.io.motion import Motion
 from jumplab.show import viewer as viewer
 from jumplab.show.viewer import FPS
-from jumplab.sim import simulate_jump
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[browser]'")
 pytestmark = [pytest.mark.slow, browser]
@@ -44,12 +44,6 @@ FAULTS = """() => {
 }"""
 # where the base of the robot that leads is on the picture, -1 ... 1 from left to right
 BASE = "() => { viewer.camera.updateMatrixWorld(); return upright(base(lead, now)).project(viewer.camera).x; }"
-
-
-@pytest.fixture(scope="module")
-def simulation():
-    p = jump(1.0, 0.5)
-    return simulate_jump(p.tape, p.robot)
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +202,7 @@ def test_a_loop_begins_again(tab, url):
     assert tab.locator("#play").inner_text() == "❚❚" and tab.trouble == []
 
 
-@published
+@needs_published
 def test_meshes_of_a_published_robot(tab, tmp_path):
     page = jl.view(jl.plan(jl.JumpTask(0.4, 0.2), "g1"))
     file = page.save(tmp_path / "g1.html")

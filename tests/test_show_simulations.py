@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixtures_core import jump
 from matplotlib.path import Path
 from matplotlib.text import Text
 from paper import diagrams, experiments, render
@@ -14,20 +13,10 @@ from scipy.ndimage import binary_dilation
 from jumplab import show as plotting
 from jumplab.robot.stance import stance_configuration
 from jumplab.show.style import MIN_FONT_PT, PHASE_COLORS
-from jumplab.sim import Scene, simulate_jump
+from jumplab.sim import Scene
 from jumplab.task import JumpTask
 
 TASK = JumpTask(1.0, 0.5)
-
-
-@pytest.fixture(scope="module")
-def tape():
-    return jump(TASK.distance_m, TASK.height_m).tape
-
-
-@pytest.fixture(scope="module")
-def result(tape, bhr):
-    return simulate_jump(tape, bhr)
 
 
 def smallest_font(fig) -> float:
@@ -37,32 +26,32 @@ def smallest_font(fig) -> float:
 # ------------------------------------------------------------------------------------------ frames
 
 
-def test_frames_show_each_phase_and_its_turning_points(result):
-    rows = render.frame_rows(result)
+def test_frames_show_each_phase_and_its_turning_points(simulation):
+    rows = render.frame_rows(simulation)
     assert len(rows) == 12 and (np.diff(rows) > 0).all()
-    assert [str(p) for p in result.phase[rows]] == ["launch"] * 4 + ["flight"] * 4 + ["landing"] * 4
-    flight = np.flatnonzero(result.phase == "flight")
-    assert (rows[0], rows[3], rows[8], rows[-1]) == (0, flight[0] - 1, flight[-1] + 1, len(result.t) - 1)
-    z = result.com[:, 2]
+    assert [str(p) for p in simulation.phase[rows]] == ["launch"] * 4 + ["flight"] * 4 + ["landing"] * 4
+    flight = np.flatnonzero(simulation.phase == "flight")
+    assert (rows[0], rows[3], rows[8], rows[-1]) == (0, flight[0] - 1, flight[-1] + 1, len(simulation.t) - 1)
+    z = simulation.com[:, 2]
     assert z[rows[1]] == z[: flight[0]].min() and z[rows[9]] == pytest.approx(z[flight[-1] + 1 :].min(), abs=1e-4)
     for low, middle, high in (rows[1:4], rows[9:12]):
         assert z[middle] == pytest.approx((z[low] + z[high]) / 2, abs=0.01)
 
 
 @pytest.mark.parametrize("end", ["before take-off", "in the air"])
-def test_frames_of_half_a_jump_are_evenly_spaced(result, end):
-    cut = int(np.argmax(result.phase == "flight")) + (0 if end == "before take-off" else 300)
-    short = replace(result, **{k: getattr(result, k)[:cut] for k in ("t", "q", "com", "phase")})
+def test_frames_of_half_a_jump_are_evenly_spaced(simulation, end):
+    cut = int(np.argmax(simulation.phase == "flight")) + (0 if end == "before take-off" else 300)
+    short = replace(simulation, **{k: getattr(simulation, k)[:cut] for k in ("t", "q", "com", "phase")})
     rows = render.frame_rows(short)
     assert len(rows) == 12 and rows[0] == 0 and rows[-1] == cut - 1
     assert np.ptp(np.diff(rows)) <= 1
 
 
-def test_frames_of_a_fall(result):
+def test_frames_of_a_fall(simulation):
     """The CoM ends lower than in the deepest knee bend: half-way up does not exist, half of the time does."""
-    com = result.com.copy()
+    com = simulation.com.copy()
     com[-1, 2] = 0.1
-    rows = render.frame_rows(replace(result, com=com))
+    rows = render.frame_rows(replace(simulation, com=com))
     assert rows[10] == (rows[9] + rows[11]) // 2
 
 
@@ -87,15 +76,15 @@ def test_trunk_pitch_counts_full_turns():
     assert experiments.trunk_pitch(q) == pytest.approx(angle)
 
 
-def test_landing_figure_tells_what_the_log_says(result, tape, bhr):
-    fig = experiments.landing_loads(result, tape, bhr)
+def test_landing_figure_tells_what_the_log_says(simulation, good, bhr):
+    fig = experiments.landing_loads(simulation, good, bhr)
     pitch, force, bars = fig.axes
-    launch = result.phase == "launch"
-    assert pitch.lines[0].get_ydata() == pytest.approx(np.degrees(experiments.trunk_pitch(result.q))[launch])
-    impulse = np.trapezoid(force.lines[0].get_ydata() * 1000, result.t[launch])
-    assert impulse == pytest.approx(result.metrics.launch_impulse[1], rel=0.06)  # 20 ms of it show up in the flight
+    launch = simulation.phase == "launch"
+    assert pitch.lines[0].get_ydata() == pytest.approx(np.degrees(experiments.trunk_pitch(simulation.q))[launch])
+    impulse = np.trapezoid(force.lines[0].get_ydata() * 1000, simulation.t[launch])
+    assert impulse == pytest.approx(simulation.metrics.launch_impulse[1], rel=0.06)  # 20 ms of it show up in the flight
     worst = {}
-    for name, share in result.metrics.max_torque_ratio_by_joint.items():
+    for name, share in simulation.metrics.max_torque_ratio_by_joint.items():
         group = name.split("_", 1)[1].replace("_", " ")
         worst[group] = max(worst.get(group, 0.0), share)
     groups = [label.get_text() for label in bars.get_yticklabels()]
@@ -106,8 +95,8 @@ def test_landing_figure_tells_what_the_log_says(result, tape, bhr):
     assert smallest_font(fig) >= MIN_FONT_PT
 
 
-def test_trials_sort_robots_by_their_fate(result):
-    m = result.metrics
+def test_trials_sort_robots_by_their_fate(simulation):
+    m = simulation.metrics
     fell = replace(m, landed=False)
     rows = [m, replace(m, foot_distance_m=0.9), fell, replace(fell, foot_distance_m=None)]
     fig = experiments.trials(rows, TASK, nominal=m)
@@ -134,7 +123,7 @@ def body(picture):
     return (picture < 0.99).any(axis=2)  # what is neither sky nor outside
 
 
-def test_camera_sees_the_robot_where_the_log_says(result, bhr):
+def test_camera_sees_the_robot_where_the_log_says(simulation, bhr):
     """Nothing of the outlines by Pinocchio, with the joints' balls, is missing; what is seen beyond is perspective.
 
     The camera is 10 m away: a near hand, 0.28 m before the jump's plane and 0.9 m off the middle of the picture, is
@@ -144,8 +133,8 @@ def test_camera_sees_the_robot_where_the_log_says(result, bhr):
     outlines, square = plotting.Silhouette(bhr), np.ones((3, 3), bool)
     x, z = np.meshgrid((np.arange(200) + 0.5) / 100 - 1.0, 1.9 - (np.arange(200) + 0.5) / 100)
     studio = render.Renderer(bhr, scene=Scene("empty", ()))
-    for row in render.frame_rows(result)[[0, 1, 5, 9]]:
-        q = result.q[row]
+    for row in render.frame_rows(simulation)[[0, 1, 5, 9]]:
+        q = simulation.q[row]
         seen = body(studio.picture(q, replace(camera, x=float(q[0]))))
         places = np.column_stack([x.ravel() + q[0], z.ravel()])
         inside = [Path(outline).contains_points(places) for _, outline in outlines.outlines(q)]
@@ -207,8 +196,8 @@ def test_the_nearer_body_hides_the_other_and_sizes_follow_perspective():
         assert canvas.image[100, 100, 0] == pytest.approx(0.65 + 0.4 * towards)
 
 
-def test_frame_strip_and_model_can_be_read(result, bhr, tmp_path):
-    strip = render.frame_strip(result, bhr, marks=(0.14, 1.14))
+def test_frame_strip_and_model_can_be_read(simulation, bhr, tmp_path):
+    strip = render.frame_strip(simulation, bhr, marks=(0.14, 1.14))
     titles = [ax.get_title() for ax in strip.axes]
     assert len(titles) == 12 and titles[0] == "launch, 0.00 s" and titles[-1].startswith("landing")
     assert all(len(ax.images) == 1 and not ax.axison for ax in strip.axes)

@@ -6,7 +6,6 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from fixtures_core import jump as planned
 from paper.basin import WrongApex
 
 from jumplab.cli.common import print_simulation
@@ -21,11 +20,6 @@ engines = import_module("jumplab.sim.bullet")
 BulletEngine = engines.BulletEngine
 SHORT_S = 0.05
 IN_FLIGHT = 1200  # step; the tape takes off a little after one second and flies for half of one
-
-
-@pytest.fixture(scope="module")
-def tape(bhr):
-    return planned(0.6, 0.3, method="direct").tape
 
 
 @pytest.fixture(scope="module")

@@ -3,18 +3,17 @@
 import hashlib
 import json
 from dataclasses import asdict, fields, replace
-from functools import cache
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump
+from fixtures_core import refused
 from test_sim_world import Hold, momentum
+from test_sim_world import engine as engine
 
 from jumplab import sim
 from jumplab.cli.common import disturbances
 from jumplab.control.kinematics import Gauge
-from jumplab.errors import InputError
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import (
     CONTACTS,
@@ -38,19 +37,8 @@ OLD = ("seed", "mass", "inertia", "com", "friction", "delay_s", "known_delay_s",
 FORCE_N = np.array([30.0, -20.0, 10.0])
 
 
-@pytest.fixture(params=INSTALLED)
-def engine(request):
-    return sim.engine_class(request.param)
-
-
-@cache
-def tape():
-    return jump(0.6, 0.3, method="direct").tape
-
-
 def test_a_negative_seed_is_refused(bhr):
-    with pytest.raises(InputError, match=r"^seed = -3 must not be negative$"):
-        Perturbation.draw(bhr, -3)
+    assert refused(Perturbation.draw, bhr, -3) == "seed = -3 must not be negative"
 
 
 def test_the_robots_of_the_usual_ranges_stay_the_same(bhr):
@@ -98,9 +86,7 @@ def test_draws_stay_within_their_ranges(bhr):
     ],
 )
 def test_ranges_beyond_what_is_documented_are_refused(ranges, sentence):
-    with pytest.raises(InputError) as e:
-        Ranges(**ranges)
-    assert str(e.value) == sentence
+    assert refused(Ranges, **ranges) == sentence
 
 
 def test_disturbances_as_they_are_typed():
@@ -113,9 +99,7 @@ def test_disturbances_as_they_are_typed():
                          (["mass=0:1"], "the range mass must be one number, a half-width, got (0.0, 1.0)"),
                          (["mass"], "--disturb must be NAME=SIZE or NAME=FROM:TO, got 'mass'"),
                          (["mass=x"], "--disturb mass must be a number, got 'x'")):  # fmt: skip
-        with pytest.raises(InputError) as e:
-            ranges_of(disturbances("--disturb", pairs))
-        assert str(e.value).startswith(words)
+        assert refused(lambda pairs=pairs: ranges_of(disturbances("--disturb", pairs))).startswith(words)
 
 
 def test_a_payload_is_a_cube_fixed_to_the_trunk(engine, bhr):
@@ -131,7 +115,7 @@ def test_a_payload_is_a_cube_fixed_to_the_trunk(engine, bhr):
 
 
 @pytest.mark.parametrize("name", INSTALLED)
-def test_rotors_and_damping_beside_the_planned_ones_are_felt(bhr, name):
+def test_rotors_and_damping_beside_the_planned_ones_are_felt(bhr, name, tape):
     ranges = Ranges.none(rotor_kg_m2=(0.02, 0.02), damping_n_m_s=(1.0, 1.0))
     assert str(ranges).endswith("rotors heavier by 0.02 ... 0.02 kg m^2, joints damped more by 1 ... 1 N m s/rad")
     drawn = Perturbation.draw(bhr, 4, ranges)
@@ -139,7 +123,7 @@ def test_rotors_and_damping_beside_the_planned_ones_are_felt(bhr, name):
     for key, more in (("armature", 0.02), ("damping", 1.0)):
         assert getattr(real.limits, key) == pytest.approx(getattr(bhr.limits, key) + more, abs=1e-15)
     assert real.total_mass == pytest.approx(bhr.total_mass, abs=1e-9)
-    run = sim.simulate_jump(tape(), bhr, perturbation=drawn, engine=name, stand_s=0.1)
+    run = sim.simulate_jump(tape, bhr, perturbation=drawn, engine=name, stand_s=0.1)
     assert run.checks_passed, [str(f) for f in run.checks if not f.passed]
     assert run.robot.limits.damping == pytest.approx(real.limits.damping)
 
@@ -217,25 +201,24 @@ def test_soft_ground_throws_nobody_up(engine, bhr, soft_m, contact):
     assert max(heights) < start[2] + 1e-3 and q[2] - 0.002 < heights[-1] < q[2]
 
 
-def test_a_shove_is_timed_by_the_plan_and_known_to_the_checks(bhr):
-    end, takeoff = float(tape().t[-1]), tape().takeoff_time
+def test_a_shove_is_timed_by_the_plan_and_known_to_the_checks(bhr, tape):
+    end, takeoff = float(tape.t[-1]), tape.takeoff_time
     shoves = tuple(Shove(phase, 1.0, 15.0, np.pi / 2) for phase in ("launch", "flight", "landing"))
-    found = Perturbation(shoves=shoves).pushes(tape())
+    found = Perturbation(shoves=shoves).pushes(tape)
     assert [p.step * STEP_S for p in found] == pytest.approx([x - 0.05 for x in (takeoff, end, end + 1)], abs=STEP_S)
     assert all(p.steps == 50 and p.force_n == pytest.approx((0, 300, 0)) for p in found)
     assert [Push(3, 2, (0.0, 0.0, 0.0)).at(k) for k in range(2, 6)] == [False, True, True, False]
-    with pytest.raises(InputError) as e:
-        Perturbation(shoves=shoves).pushes(None)
-    assert str(e.value) == "a shove, and other ground for the landing, are for a single jump; leave them out of a chain"
+    said = refused(Perturbation(shoves=shoves).pushes, None)
+    assert said == "a shove, and other ground for the landing, are for a single jump; leave them out of a chain"
 
 
 @pytest.mark.parametrize("name", INSTALLED)
-def test_a_disturbed_run_passes_and_a_hidden_shove_does_not(bhr, name):
+def test_a_disturbed_run_passes_and_a_hidden_shove_does_not(bhr, name, tape):
     """Everything at once; the momentum in the log is that of gravity, ground and shove, for which the log says so."""
     told = dict(payload_kg=(3, 3), torque_loss=(0.1, 0.1), sag_per_kw=(0.02, 0.02), ground_m=0.02, ground_tilt_deg=2,
                 soft_m=(0.003, 0.003), shove_flight_n_s=(8, 8), posture_deg=1)  # fmt: skip
     drawn = Perturbation.draw(bhr, 5, Ranges.none(**told), SensorNoise.typical())
-    run = sim.simulate_jump(tape(), bhr, perturbation=drawn, engine=name, stand_s=0.1)
+    run = sim.simulate_jump(tape, bhr, perturbation=drawn, engine=name, stand_s=0.1)
     assert run.checks_passed, [str(f) for f in run.checks if not f.passed]
     assert run.settings["perception"]["state"] == "estimated" and run.link_names[-1] == "payload"
     (push,) = run.settings["pushes"]
@@ -248,18 +231,16 @@ def test_a_disturbed_run_passes_and_a_hidden_shove_does_not(bhr, name):
     assert "unexplained force on the body" in {f.name for f in check(hidden) if not f.passed}
 
 
-def test_the_landing_is_moved_and_the_start_is_not(bhr):
-    ground = Perturbation(ground_m=0.03, ground_tilt_rad=(0.05, -0.03)).ground(Scene.flat(), bhr, tape())
-    end = Gauge(bhr).soles(tape().q[-1])
+def test_the_landing_is_moved_and_the_start_is_not(bhr, tape):
+    ground = Perturbation(ground_m=0.03, ground_tilt_rad=(0.05, -0.03)).ground(Scene.flat(), bhr, tape)
+    end = Gauge(bhr).soles(tape.q[-1])
     assert ground.top_at(0.0) == ground.top_at(0.1, 0.5) == 0
     assert ground.top_at(end[0]) == pytest.approx(0.03, abs=2e-3)
     slope = (ground.top_at(end[0] + 0.1) - ground.top_at(end[0])) / 0.1
     assert slope == pytest.approx(-np.tan(0.05), rel=1e-3)  # a positive pitch goes downhill
     assert (ground.top_at(end[0], 0.1) - ground.top_at(end[0])) / 0.1 == pytest.approx(-0.03, rel=0.01)
-    short = replace(tape(), q=np.vstack([tape().q[:-1], tape().q[:1]]))
-    with pytest.raises(InputError) as e:
-        Perturbation(ground_m=0.03).ground(Scene.flat(), bhr, short)
-    assert str(e.value) == (
+    short = replace(tape, q=np.vstack([tape.q[:-1], tape.q[:1]]))
+    assert refused(Perturbation(ground_m=0.03).ground, Scene.flat(), bhr, short) == (
         "the soles land 0.00 m from where they start, so ground_* would also change the ground of the start; "
         "jump farther, or leave out ground_*"
     )
@@ -308,17 +289,16 @@ def test_boxes_lie_where_the_heights_are():
         (Scene("none", ()), f"a corner of its soles is +{1e3 * REACH_M:.0f} mm above the ground, at most 5; let"),
     ],
 )  # fmt: skip
-def test_a_scene_that_the_robot_cannot_stand_on_is_refused(bhr, scene, sentence):
-    with pytest.raises(InputError) as e:
-        sim.simulate_jump(tape(), bhr, scene=scene)
-    assert str(e.value).startswith(f"scene {scene.name}: the robot cannot stand on it at the start, {sentence}")
+def test_a_scene_that_the_robot_cannot_stand_on_is_refused(bhr, scene, sentence, tape):
+    said = refused(sim.simulate_jump, tape, bhr, scene=scene)
+    assert said.startswith(f"scene {scene.name}: the robot cannot stand on it at the start, {sentence}")
 
 
 @pytest.fixture(scope="module")
-def fall(bhr):
+def fall(bhr, tape):
     """A real one: a shove of 60 N s to the side while it lands."""
     drawn = Perturbation(shoves=(Shove("landing", 0.0, 60.0, np.pi / 2),), friction=1.0)
-    return sim.simulate_jump(tape(), bhr, perturbation=drawn)
+    return sim.simulate_jump(tape, bhr, perturbation=drawn)
 
 
 def test_a_shoved_robot_tips(fall):

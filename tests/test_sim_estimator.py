@@ -3,7 +3,6 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump as planned
 
 from jumplab.control.estimator import Estimator
 from jumplab.control.kinematics import State
@@ -12,11 +11,6 @@ from jumplab.sim import Perturbation, SensorNoise, simulate_jump
 from jumplab.sim.sensors import LEVER_M, Perception, Sensors, estimation_error
 
 STILL = np.zeros((2, 6))
-
-
-@pytest.fixture(scope="module")
-def tape(bhr):
-    return planned(0.6, 0.3, method="direct").tape
 
 
 @pytest.fixture(scope="module")

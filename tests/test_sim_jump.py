@@ -38,11 +38,6 @@ DISTANCE, HEIGHT = 0.6, 0.3
 SHORT_S = 0.3  # enough to compare launches and flights
 
 
-@pytest.fixture(scope="module")
-def tape(bhr):
-    return fixtures_core.jump(DISTANCE, HEIGHT, method="direct").tape
-
-
 @pytest.fixture(scope="module", params=[("position", INSTALLED[0]), ("pd", INSTALLED[-1])])
 def jump(request, bhr, tape):
     mode, engine = request.param
@@ -295,6 +290,11 @@ def test_standing_still_is_no_jump(bhr, tape):
     json.dumps(run.to_json(), allow_nan=False)
 
 
+def force_of(parts) -> np.ndarray:
+    """So many rows of each force [N]."""
+    return np.repeat([float(f) for _, f in parts], [n for n, _ in parts])
+
+
 def test_events_from_forces():
     for parts, rows in (
         (((100, 400), (300, 0), (100, 900)), (100, 400)),
@@ -304,20 +304,19 @@ def test_events_from_forces():
         (((100, 400), (300, 0)), (100, None)),
         (((100, 400),), None),
     ):
-        force = np.concatenate([np.full(n, f, float) for n, f in parts])
-        assert events(force, lambda row: np.array([2e-3 * row, 0, 0])) == ([rows] if rows else [])
+        assert events(force_of(parts), lambda row: np.array([2e-3 * row, 0, 0])) == ([rows] if rows else [])
 
 
 def test_as_many_flights_as_the_plan_has():
     parts = (100, 400), (300, 0), (50, 900), (200, 0), (10, 300), (100, 0)
-    force = np.concatenate([np.full(n, f, float) for n, f in parts])
+    force = force_of(parts)
     rows = [(100, 400), (450, 650), (660, None)]
     for count in (1, 2, 3):
         assert events(force, lambda row: np.array([2e-3 * row, 0, 0]), count) == rows[:count]
 
 
 def test_a_crouch_that_unloads_the_feet_is_no_flight():
-    force = np.concatenate([np.full(n, f, float) for n, f in ((100, 9), (200, 0), (80, 90), (300, 0), (9, 90))])
+    force = force_of(((100, 9), (200, 0), (80, 90), (300, 0), (9, 90)))
     assert events(force, lambda row: np.array([0, 0, 1e-3 * max(row - 380, 0)])) == [(380, 680)]
     assert events(force, lambda row: np.zeros(3)) == []
 
@@ -423,11 +422,3 @@ def test_toes_at_touchdown_are_those_of_the_feet_that_are_to_land(bhr, tape):
 def test_bad_options(bhr, tape, options, words):
     with pytest.raises(InputError, match=words):
         simulate(tape, bhr, **options)
-
-
-def test_a_tape_of_another_robot(bhr, tape):
-    other = Robot.from_text(
-        bhr.urdf.replace("left_knee", "left_knie"), bhr.config_text.replace("left_knee", "left_knie")
-    )
-    with pytest.raises(InputError, match="are not those of robot bhr"):
-        simulate(tape, other)

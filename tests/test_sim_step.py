@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fixtures_core import jump
 
 from jumplab.control.landing import SOLE_SHARE
 from jumplab.control.step import BESIDE_M, BEYOND_S, SETTLED_S, SWING_S, RecoveryStep, beyond_hull
@@ -16,24 +15,14 @@ from jumplab.studies.trials import TrialKey, TrialSettings, run_trials
 AHEAD = Perturbation(shoves=(Shove("landing", 0.46, 25.0, 0.3),))
 
 
-def tape():
-    return jump(1.0, 0.5).tape
-
-
 def body(com=(0.0, 0.0, 0.8), velocity=(0.0, 0.0, 0.0), turned_rad=0.0):
     """A pendulum over two soles 0.2 m apart, all seen along a heading."""
     c, s = np.cos(turned_rad), np.sin(turned_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     soles = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]) @ turn.T
-    return SimpleNamespace(
-        com=turn @ com,
-        com_velocity=turn @ velocity,
-        soles=soles,
-        attitudes=np.array([turn, turn]),
-        twists=np.zeros((2, 6)),
-        gravity=np.array([0.0, 0.0, -9.8]),
-        size=Size(1.0, 1.0),
-    )
+    still = dict(twists=np.zeros((2, 6)), gravity=np.array([0.0, 0.0, -9.8]), size=Size(1.0, 1.0))
+    attitudes = np.array([turn, turn])
+    return SimpleNamespace(com=turn @ com, com_velocity=turn @ velocity, soles=soles, attitudes=attitudes, **still)
 
 
 def test_distance_from_a_hull():
@@ -87,16 +76,16 @@ def test_a_step_ends_when_the_foot_stands_or_its_time_is_over_and_the_next_waits
         assert len(waits_s) and np.all(waits_s > SETTLED_S + BEYOND_S - 0.003) and waits_s.max() < 0.2
 
 
-def test_a_jump_that_needs_no_step_is_the_same_with_it(bhr):
-    plain, allowed = (simulate_jump(tape(), bhr, step=on, stand_s=0.5) for on in (False, True))
+def test_a_jump_that_needs_no_step_is_the_same_with_it(bhr, good):
+    plain, allowed = (simulate_jump(good, bhr, step=on, stand_s=0.5) for on in (False, True))
     assert allowed.metrics.recovery_step_s is None and allowed.metrics.recovery_steps == 0
     assert np.array_equal(plain.q, allowed.q)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", INSTALLED[-1:])
-def test_a_shove_after_the_landing_is_caught_by_a_step(bhr, engine):
-    held, caught = (simulate_jump(tape(), bhr, perturbation=AHEAD, step=on, engine=engine) for on in (False, True))
+def test_a_shove_after_the_landing_is_caught_by_a_step(bhr, engine, good):
+    held, caught = (simulate_jump(good, bhr, perturbation=AHEAD, step=on, engine=engine) for on in (False, True))
     assert not held.landed and held.metrics.recovery_step_s is None
     assert caught.landed and caught.checks_passed, caught.reason
     assert caught.metrics.recovery_step_s > 0.15
@@ -107,11 +96,11 @@ def test_a_shove_after_the_landing_is_caught_by_a_step(bhr, engine):
 
 
 @pytest.mark.slow
-def test_trials_count_the_steps(bhr, tmp_path):
+def test_trials_count_the_steps(plan, tmp_path):
     from jumplab import save
     from jumplab.sim import Ranges
 
-    save(tmp_path, jump(1.0, 0.5))
+    save(tmp_path, plan)
     ranges = Ranges.none(shove_landing_n_s=(25.0, 25.0))
     report = run_trials(tmp_path, 2, 0, TrialSettings(ranges=ranges, step=True), jobs=1)
     assert 0 < report.stepped <= report.landed

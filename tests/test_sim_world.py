@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import planner, refused
 
 from jumplab import sim
 from jumplab.control.kinematics import Gauge
@@ -17,7 +18,6 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.sim import INSTALLED, STEP_S, Perturbation, Ranges, Scene, SensorNoise, engine_class, simulate_jump
 from jumplab.sim import engine as engines
 from jumplab.sim.motors import Motors
-from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 with_bullet = pytest.mark.skipif("bullet" not in INSTALLED, reason="PyBullet is not installed")
@@ -136,9 +136,7 @@ def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch, engin
     monkeypatch.setattr(engines, "INSTALLED", ("bullet", "mujoco"))
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, f"jumplab.sim.{engine}", raising=False)
-    with pytest.raises(InputError) as caught:
-        engine_class(engine)
-    assert str(caught.value) == f"engine {engine!r}: the package {package} is not installed; {cure}"
+    assert refused(engine_class, engine) == f"engine {engine!r}: the package {package} is not installed; {cure}"
 
 
 @pytest.mark.parametrize("friction", [0.37, 0.8])
@@ -200,8 +198,8 @@ def test_foot_sensors_weigh_the_robot(engine, bhr):
 
 
 @pytest.fixture(scope="module")
-def front_flip(bhr):
-    return Planner(bhr).plan(JumpTask(0.0, 0.5, rotation_rad=2 * np.pi)).tape
+def front_flip():
+    return planner().plan(JumpTask(0.0, 0.5, rotation_rad=2 * np.pi)).tape
 
 
 def test_a_toe_that_pushes_off_stays_on_the_ground(engine, bhr, front_flip):

@@ -14,7 +14,7 @@ import fixtures_robots as robots
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump, planner
+from fixtures_core import jump, planner, refused
 
 from jumplab.errors import RobotError
 from jumplab.models.spatial import SpatialModel, SpatialState
@@ -190,18 +190,15 @@ def test_joints_that_turn_for_ever_are_refused():
     joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
     model.addJoint(joint, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
     model.name = "cart"
-    with pytest.raises(RobotError) as e:
-        SpatialModel(model)
-    assert str(e.value) == "robot cart: joint 'wheel' must be revolute and have a range"
+    assert refused(SpatialModel, model, by=RobotError) == "robot cart: joint 'wheel' must be revolute and have a range"
 
 
 def test_free_base_is_needed():
     model = pin.Model()
     model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "hinge")
     model.name = "arm"
-    with pytest.raises(RobotError) as e:
-        SpatialModel(model)
-    assert str(e.value) == "robot arm: the spatial model needs a free base and joints of one degree of freedom each"
+    said = refused(SpatialModel, model, by=RobotError)
+    assert said == "robot arm: the spatial model needs a free base and joints of one degree of freedom each"
 
 
 # even motions -----------------------------------------------------------------------------------------------------

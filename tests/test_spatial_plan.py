@@ -1,7 +1,6 @@
 """Jumps in three dimensions: planned, on tape exact, audited, played back, re-planned, refused."""
 
 import json
-import re
 from dataclasses import replace
 from functools import cache, partial
 from itertools import chain, repeat
@@ -11,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import slopes
+from fixtures_core import planner, refused, slopes
 from paper.basin import WrongApex
 from test_transcription import data_vector, sparse
 
@@ -23,7 +22,7 @@ from jumplab.cli.main import main
 from jumplab.control.kinematics import Gauge, headed, pitch_of, rotation
 from jumplab.control.playback import Playback
 from jumplab.control.servo import WholeBodyServo
-from jumplab.errors import InfeasibleError, InputError, SolverError
+from jumplab.errors import InfeasibleError, SolverError
 from jumplab.models.spatial import SpatialState
 from jumplab.ocp.nlp import EXPLAINED
 from jumplab.ocp.posing import pack
@@ -33,21 +32,11 @@ from jumplab.robot.stance import configuration, stance_angles
 from jumplab.sim import STEP_S, simulate_jump
 from jumplab.sim.scene import Scene
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Contacts, Limits, Mesh, Place, Weights, WholeBodyPlanner
+from jumplab.stages.whole_body import Contacts, Limits, Mesh, Place, Weights, WholeBodyPlanner, between
 from jumplab.stages.whole_body import plan as ended
 from jumplab.stages.whole_body import planner as planning
 from jumplab.stages.whole_body.apart import MORE_M, NODES, face_gaps, merged, placed, too_close, used_apart
-from jumplab.stages.whole_body.between import (
-    ACCELERATION_GAP,
-    CLEAR_M,
-    FRICTION,
-    LOADED_N,
-    MIDDLE,
-    PRESSURE_GAP,
-    RATE_GAP,
-    SUNK_M,
-    used_between,
-)
+from jumplab.stages.whole_body.between import used_between
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.coordinates import BASE, even
 from jumplab.stages.whole_body.ground import Surface, surface_of_jump
@@ -61,11 +50,6 @@ from jumplab.task import JumpTask
 
 SIDE = JumpTask(0.0, 0.4, side_m=0.3)
 TURN = JumpTask(0.2, 0.4, side_m=-0.1, yaw_rad=np.pi / 3)
-
-
-@cache
-def planner() -> Planner:
-    return Planner(jl.Robot.load())
 
 
 @cache
@@ -85,11 +69,6 @@ def step():
     """Plan and tape of that step."""
     plan = walker().plan(JumpTask(0.0, 0.2))
     return plan, plan.tape
-
-
-@cache
-def run(task: JumpTask, mode: str, engine: str):
-    return jl.simulate(jump(task), mode=mode, engine=engine)
 
 
 @pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
@@ -130,7 +109,7 @@ def test_tape_is_smooth_up_to_each_take_off_and_landing(name):
     moves = np.setdiff1d(np.arange(len(dt)), twice)
     mean = (tape.v[1:, 6:] + tape.v[:-1, 6:]) / 2
     gap = np.diff(tape.q[:, 7:], axis=0)[moves] / dt[moves] - mean[moves]
-    assert np.abs(gap).max() < RATE_GAP
+    assert np.abs(gap).max() < between.RATE_GAP
 
 
 @pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
@@ -214,7 +193,7 @@ def test_audit_sees_another_goal():
 @pytest.mark.parametrize("task, mode", [(SIDE, "position"), (TURN, "pd")], ids=["side", "turn"])
 @pytest.mark.parametrize("engine", ["bullet", "mujoco"])
 def test_playback_lands_in_its_place_and_heading(task, engine, mode):
-    result = run(task, mode, engine)
+    result = jl.simulate(jump(task), mode=mode, engine=engine)
     m = result.metrics
     assert result.landed and result.checks_passed, result.reason
     assert np.hypot(m.foot_distance_m - task.distance_m, m.side_m - task.side_m) < 0.02
@@ -336,24 +315,19 @@ def test_where_the_patience_is_spent_nothing_more_is_tried(doubted, monkeypatch)
 def test_a_motion_that_breaks_limits_between_the_nodes_is_none(doubted):
     last, known, said = doubted
     said(2.0, 1.9, 1.8)
-    with pytest.raises(SolverError) as e:
+    said = "^whole body: motions that keep every limit at the nodes break that of distance of links between them, at "
+    said += "best by a factor of 1.8, pressed by .*capture window; ask for less, or for a finer mesh$"
+    with pytest.raises(SolverError, match=said) as e:
         last(AHEAD, near=known)
-    assert re.fullmatch(
-        "whole body: motions that keep every limit at the nodes break that of distance of links between them, at best "
-        "by a factor of 1.8, pressed by .*capture window; ask for less, or for a finer mesh",
-        str(e.value),
-    )
     assert len(e.value.violations) == 5
 
 
 def test_limits_between_the_nodes_are_seen(bhr):
     tape = jump(SIDE).tape
     assert 0.5 < used_between(tape, bhr) <= 1
-    assert [LIMITS[f"{x} against {y}"].limit for x, y in (("rates", "positions"), ("accelerations", "rates"))] == [
-        RATE_GAP,
-        ACCELERATION_GAP,
-    ]
-    assert (FRICTION, LOADED_N) == (LIMITS["friction used"].limit, METHOD.friction_force_n)
+    limits = [LIMITS[name].limit for name in ("rates against positions", "accelerations against rates")]
+    assert limits == [between.RATE_GAP, between.ACCELERATION_GAP]
+    assert (between.FRICTION, between.LOADED_N) == (LIMITS["friction used"].limit, METHOD.friction_force_n)
     row, effort = len(tape.t) // 3, bhr.actuators["left_ankle_pitch"]["effort"]
     for name, column, change in (("tau", bhr.joint_names.index("left_ankle_pitch"), effort), ("v", 12, 0.05)):
         moved = getattr(tape, name).copy()
@@ -366,31 +340,30 @@ def test_limits_between_the_nodes_are_seen(bhr):
     assert np.all(tape.extra["contacts"][row] == FLAT)
     for share in (0.99, 1.01):
         pushed = tape.f.copy()
-        aside = share * FRICTION * below
+        aside = share * between.FRICTION * below
         pushed[row, 0, :2] = 0.0, aside
         pushed[row, 0, 3:5] += down * (aside - tape.f[row, 0, 1]), down * ahead  # the CoP stays
         used = used_between(replace(tape, f=pushed), bhr)
         assert (used <= 1) == (share < 1) and used >= share - 1e-9
     for share in (0.9, 1.5):
         pushed = tape.f.copy()
-        pushed[row, 0, 4] = -down * ahead - (bhr.foot.toe + share * PRESSURE_GAP) * below  # the CoP beyond the toes
+        pushed[row, 0, 4] = (
+            -down * ahead - (bhr.foot.toe + share * between.PRESSURE_GAP) * below
+        )  # the CoP beyond the toes
         used = used_between(replace(tape, f=pushed), bhr)
         assert used == pytest.approx(max(share, used_between(tape, bhr)), abs=1e-6)
 
 
 def test_soles_that_are_low_between_the_nodes_are_seen(bhr):
     """2 cm in the middle of a flight as the audit asks, 1 mm in the ground elsewhere; also on a platform."""
-    assert (CLEAR_M, SUNK_M, MIDDLE) == (
-        1e-3 * LIMITS["foot clearance"].limit,
-        1e-3 * LIMITS["penetration"].limit,
-        tuple(METHOD.mid_flight),
-    )
+    asked = 1e-3 * LIMITS["foot clearance"].limit, 1e-3 * LIMITS["penetration"].limit, tuple(METHOD.mid_flight)
+    assert (between.CLEAR_M, between.SUNK_M, between.MIDDLE) == asked
     plan = jl.plan(jl.JumpTask(0.6, 0.4, 0.15), bhr)
     tape, body = plan.tape, plan.whole_body
     surface = Surface(0.15, bhr.foot.toe - float(bhr.foot.center[0]) + body.edge_m)
     assert body.used == pytest.approx(used_between(tape, bhr, surface), abs=1e-9) and body.used <= 1
     flying = np.flatnonzero(tape.phase == "flight")
-    for part, low, depth in ((0.5, CLEAR_M, 0.001), (0.99, 0.0, 0.002)):
+    for part, low, depth in ((0.5, between.CLEAR_M, 0.001), (0.99, 0.0, 0.002)):
         k = flying[int(part * len(flying))]
         moved = tape.q.copy()
         moved[k, 2] -= _lowest(bhr, tape.q[k], surface) - low + depth
@@ -435,16 +408,14 @@ def test_points_know_the_robot_by_name(bhr):
     assert ca.is_equal(p.joint_rates.left_knee, known["v"][knee])
     assert p.com.shape == p.com_velocity.shape == p.L.shape == p.attitude.shape == p.point("left_knee").shape == (3, 1)
     assert p.torques.knee.shape == (2, 1) and all(x.is_zero() for x in p.feet_forces) and p.wrench.is_zero()
-    with pytest.raises(InputError) as e:
-        p.point("elbow")
-    assert str(e.value).startswith("the robot has no point 'elbow'; it has left_ankle_pitch, left_ankle_roll")
+    said = refused(p.point, "elbow")
+    assert said.startswith("the robot has no point 'elbow'; it has left_ankle_pitch, left_ankle_roll")
 
 
 def test_platforms_that_would_lie_under_a_sole_are_refused():
-    with pytest.raises(InfeasibleError) as e:
-        planner().plan(replace(SIDE, platform_m=0.2), "direct")
     said = "platform = 0.2 m at a distance of 0.3 m: the two surfaces would meet under a sole of bhr; the "
-    assert str(e.value) == said + "distance must be at least 0.35 m"
+    said += "distance must be at least 0.35 m"
+    assert refused(planner().plan, replace(SIDE, platform_m=0.2), "direct", by=InfeasibleError) == said
     surface_of_jump(Body(jl.Robot.load()), Limits(), replace(SIDE, side_m=0.35, platform_m=0.2))
 
 
@@ -528,9 +499,7 @@ def test_targets_out_of_the_plane_are_checked():
         ({"yaw_rad": 7}, "yaw = 7 rad is outside -6.28319 ... 6.28319 rad"),
         ({"yaw_rad": "left"}, "yaw must be a number in rad, got 'left'"),
     ):
-        with pytest.raises(InputError) as e:
-            JumpTask(0.5, 0.4, **wrong)
-        assert str(e.value) == sentence
+        assert refused(JumpTask, 0.5, 0.4, **wrong) == sentence
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import pendulum, turned
+from fixtures_core import pendulum, refused, turned
 from paper.srmp_touchdown import touchdown_of_plan
 
 from jumplab.control import LandingController
@@ -189,8 +189,7 @@ def test_a_landing_is_planned_from_a_full_state_or_refused():
     caught = planner().plan(touchdown_of_state(robot, q, falling))
     assert caught.touchdown.com_velocity[1] > -2.5
     np.testing.assert_allclose(caught.com[0], caught.touchdown.com, atol=1e-6)
-    with pytest.raises(SolverError, match="landing"):
-        planner().plan(touchdown_of_state(robot, q, away))
+    assert "landing" in refused(planner().plan, touchdown_of_state(robot, q, away), by=SolverError)
 
 
 def test_the_landing_controller_takes_the_plan_as_its_reference():

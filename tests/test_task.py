@@ -5,6 +5,7 @@ from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
+from fixtures_core import refused
 
 from jumplab.errors import InputError
 from jumplab.task import GRAVITY, JumpTask
@@ -82,14 +83,11 @@ def test_refusals(values, sentence):
 
 
 def test_a_number_too_large_for_a_float():
-    with pytest.raises(InputError, match=r"^distance must be finite, got 10"):
-        JumpTask(10**400, 0.5)
+    assert refused(JumpTask, 10**400, 0.5).startswith("distance must be finite, got 10")
 
 
 def test_touchdown_above_the_apex():
-    with pytest.raises(InputError) as e:
-        JumpTask(1.0, 0.5).flight_time(0.52)
-    assert str(e.value) == (
+    assert refused(JumpTask(1.0, 0.5).flight_time, 0.52) == (
         "a CoM rise of 0.5 m cannot reach a touchdown 0.520 m above take-off; the rise must be at least that"
     )
     with pytest.raises(InputError):

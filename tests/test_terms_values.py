@@ -260,9 +260,18 @@ class Seen:
     def both(self) -> list[int]:
         return [0] if self.plane else [0, 1]
 
+    @property
+    def attitude(self) -> list[int]:
+        """Coordinates of the base that turn it."""
+        return [5] if self.plane else [3, 4, 5]
+
+    @property
+    def moved(self) -> list[int]:
+        """Coordinates that turn the base and all joints."""
+        return self.attitude + [6 + k for k in self.moving]
+
     def common(self) -> dict:
         """Terms at the nodes of every phase."""
-        attitude = [5] if self.plane else [3, 4, 5]
         free = [6 + k for k in self.joints]
         tau = np.zeros(len(self.names))
         for k, torque in zip(self.joints, self.tau, strict=True):
@@ -272,7 +281,7 @@ class Seen:
         effort = self.motor("effort")
         slope = LIM.torque_share * self.motor("effort")
         slope = slope / (self.motor("no_load_speed") - self.motor("corner_speed"))
-        x = {"acceleration": self.accels[attitude + [6 + k for k in self.moving]], "torque": tau}
+        x = {"acceleration": self.accels[self.moved], "torque": tau}
         x["joint dynamics"] = (self.needed[self.joints] - self.tau) / effort
         x["base forces"] = self.base_force[[0, 2] if self.plane else [0, 1, 2]]
         x["base moments"] = self.base_moment[[1] if self.plane else [0, 1, 2]]
@@ -400,16 +409,15 @@ class Seen:
             speed = axes @ linear
             spins.append((axes @ angular)[self.spins])
             sticking.append(EDGES @ speed[:2] - LIM.touchdown_slope * speed[2])
-        attitude = [5] if self.plane else [3, 4, 5]
         asked = np.array([0.0, 0.0, 0.0, yaw, 0.0, self.par["rotation"]])
         knees = [self.robot.joints["knee"][k] for k in self.both]
         rows = {"touchdown of the feet": feet, "foot rates at touchdown": spins}
         if not self.plane:
             rows["soles that stick at touchdown"] = sticking
-        rows["attitude at touchdown"] = (self.chart[:6] - asked)[attitude]
+        rows["attitude at touchdown"] = (self.chart[:6] - asked)[self.attitude]
         rows["knees at touchdown"] = [self.chart[6 + self.names.index(name)] for name in knees]
         rows["joint rates at touchdown"] = self.rates[[6 + k for k in self.joints]]
-        return rows | {"trunk rates at touchdown": self.rates[attitude], "capture window": self.caught()}
+        return rows | {"trunk rates at touchdown": self.rates[self.attitude], "capture window": self.caught()}
 
     def caught(self) -> np.ndarray:
         ahead = turn_about_z(self.par["yaw"]) @ [LIM.capture_offset_m, 0.0, 0.0]
@@ -457,9 +465,7 @@ def test_terms_of_the_whole_body_on_the_ground(programs, body, place, seed):
         arm = LIM.friction * LIM.torsion_arm_m * total[2] ** 2
         expected[f"spin of {SIDES[side]} foot"] = arm - BOTH * (total @ about)
     check(of(problem, phase.name, "node"), expected, p)
-    jerks = x.full(x.jerks)
-    attitude = [5] if x.plane else [3, 4, 5]
-    check(of(problem, phase.name, "mid"), {"jerk": jerks[attitude + [6 + k for k in x.moving]]}, p)
+    check(of(problem, phase.name, "mid"), {"jerk": x.full(x.jerks)[x.moved]}, p)
     end = {}
     if place == ("whole body", "toe"):
         slack = max(LIM.momentum_share * 3.0, LIM.momentum_slack)
@@ -477,8 +483,7 @@ def test_terms_of_the_whole_body_in_flight(programs, body, name, seed):
     if name == "whole body":
         expected |= x.tracking()
     check(of(problem, "flight", "node"), expected, p)
-    attitude = [5] if x.plane else [3, 4, 5]
-    check(of(problem, "flight", "mid"), {"jerk": x.full(x.jerks)[attitude + [6 + k for k in x.moving]]}, p)
+    check(of(problem, "flight", "mid"), {"jerk": x.full(x.jerks)[x.moved]}, p)
     check(of(problem, "flight", "end"), x.touchdown(), p)
     missing = x.constant("vel")[-1] - x.par["takeoff_speed"]
     check(of(problem, "flight", "start"), {"vertical take-off speed": missing}, p)
@@ -596,7 +601,6 @@ def test_a_tuck_opens_slowly_if_asked(body, share, begun):
     assert term.upper == pytest.approx(0.5 * x.motor("speed")) and term.lower == pytest.approx(-term.upper)
 
 
-# what an own term sees --------------------------------------------------------------------------------------------
 # stage 1 --------------------------------------------------------------------------------------------------------
 class Rod:
     """The pendulum written out: a rod (theta, phi) from the pivot, and a barbell (theta_pl, varphi) on it."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures_core import import_graph, jump
+from fixtures_core import import_graph, on_file, refused
 from paper import margins
 from paper.margins import margin_chart
 from paper.runs import features
@@ -30,22 +30,10 @@ from jumplab.studies.trials import PlanOnFile, Trial, TrialKey, TrialSettings, r
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def planned(place):
-    """A small real plan on file."""
-    plan = jump(0.6, 0.3, method="direct")
-    store.write_plan(place / "plan", plan.tape, plan.robot, plan.summary)
-    return place / "plan"
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return planned(tmp_path)
-
-
 @pytest.fixture(scope="module")
 def real(tmp_path_factory):
     """One trial for real: its folder, its report, and the simulation that it was."""
-    folder, runs = planned(tmp_path_factory.mktemp("real")), []
+    folder, runs = on_file(tmp_path_factory.mktemp("real") / "plan"), []
     simulate = monte_carlo.simulate_jump
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(monte_carlo, "simulate_jump", lambda *a, **k: runs.append(simulate(*a, **k)) or runs[-1])
@@ -252,8 +240,7 @@ def test_a_plan_that_is_replaced_meanwhile_keeps_its_own_folder(folder, bhr, coi
         return play(*args)
 
     monkeypatch.setattr(monte_carlo, "run_trial", replacing)
-    with pytest.raises(InputError, match="has been planned again in the meantime"):
-        run_trials(folder, 1, jobs=1)
+    assert "has been planned again in the meantime" in refused(run_trials, folder, 1, jobs=1)
     assert not {"trials.json", "trials.jsonl"} & set(names(folder))
 
 
@@ -268,9 +255,7 @@ def test_a_plan_that_is_replaced_meanwhile_keeps_its_own_folder(folder, bhr, coi
 )
 def test_bad_numbers(folder, arguments, sentence):
     before = names(folder)
-    with pytest.raises(InputError) as e:
-        run_trials(folder, *arguments)
-    assert str(e.value) == sentence and names(folder) == before
+    assert refused(run_trials, folder, *arguments) == sentence and names(folder) == before
 
 
 # ------------------------------------------------------------------------------------------ causes, falls, margins
@@ -377,9 +362,8 @@ def test_margins_of_other_ways_and_their_picture(folder, monkeypatch):
 def test_margins_of_what_is_not_there(folder):
     with pytest.raises(InputError, match=r"^no disturbance is called 'wind'; there are mass, com_m, "):
         margins.margins(folder, ("wind",), 2, jobs=1)
-    with pytest.raises(InputError) as e:
-        margins.MarginReport.from_json({"margins": [{}]})
-    assert str(e.value) == "not the margins of a plan (KeyError); make them with 'jumplab margins'"
+    said = refused(margins.MarginReport.from_json, {"margins": [{}]})
+    assert said == "not the margins of a plan (KeyError); make them with 'jumplab margins'"
     whole = {name: margins.ranges_at(name, 1.0) for name in (*margins.SINGLE, *margins.PAIRS)}
     assert whole["friction"].friction == (0.3, 0.3) and whole["delay_s"].delay_s == (0.0, 0.008)
     assert all(margins.ranges_at(name, 0.0) == Ranges.none() for name in whole)

@@ -18,6 +18,7 @@ import joblib
 import numpy as np
 import psutil
 import pytest
+from fixtures_core import refused
 from paper import clips
 from test_store import make_summary, make_tape
 from test_urdf_checks import TEXTS
@@ -159,8 +160,7 @@ def test_no_link_below_a_result_folder_is_followed(bhr, tmp_path, name):
         "trials.jsonl": lambda: open_study(place / name, "trials").__enter__(),
         "falls": lambda: reading.below(place, name, "1"),
     }
-    with pytest.raises(InputError, match=r"is a symbolic link, which no result folder holds; remove it$"):
-        calls[name]()
+    assert refused(calls[name]).endswith("is a symbolic link, which no result folder holds; remove it")
     if foreign.is_file():
         assert foreign.read_text() == "mine\n{half"
     else:
@@ -394,5 +394,4 @@ def test_a_pair_of_texts_is_checked_as_a_urdf_is(bhr, tmp_path):
     (tmp_path / "bhr.urdf").write_text(wrong)
     (tmp_path / "my.toml").write_text(bhr.config_text)
     for call in (lambda: jl.Robot.load(tmp_path / "my.toml"), lambda: jl.Robot.from_text(wrong, bhr.config_text)):
-        with pytest.raises(InputError, match=r"link 'trunk': mass = '19\.994kg' must be a finite number of kg$"):
-            call()
+        assert refused(call).endswith("link 'trunk': mass = '19.994kg' must be a finite number of kg")

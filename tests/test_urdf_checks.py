@@ -88,12 +88,9 @@ FILES = [
     ("gzip", b"\x1f\x8b\x08robot", "my.urdf: is a compressed archive, not a URDF; unpack it first"),
     ("binary", b"solid\xff\xfe", "my.urdf: is binary (byte 5 is no UTF-8 text); a URDF is an XML text"),
     ("zeros", b"<robot>\0\0", "my.urdf: is binary (byte 7 is no UTF-8 text); a URDF is an XML text"),
-    (
-        "lfs",
-        b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
-        "my.urdf: is a Git LFS pointer of 56 bytes, not the file itself; run 'git lfs pull'",
-    ),
-]
+    ("lfs", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
+     "my.urdf: is a Git LFS pointer of 56 bytes, not the file itself; run 'git lfs pull'"),
+]  # fmt: skip
 
 TEXTS = [
     ("html", "<!DOCTYPE html><html></html>", "is a web page (HTML), not a URDF; download the raw file"),
