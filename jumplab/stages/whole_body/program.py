@@ -155,8 +155,7 @@ class Program(Shown):
     def like(self, robot: Robot) -> Program:
         """The same for another robot with the same joints."""
         body = Body(robot)
-        free = KINDS[self.free.kind](body)
-        return replace(self, body=body, free=free, keep=False)
+        return replace(self, body=body, free=KINDS[self.free.kind](body), keep=False)
 
     @property
     def size(self) -> int:
