@@ -108,14 +108,14 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
     would come down on the schedule's block; the sentence names the phase.
     """
     height, first = contacts.surface
+    n_initial = len(contacts.first)
+    if contacts.aimed:
+        height = task.platform_m
+        numbers = range(n_initial, len(contacts.landings))
+        first = sum(not contacts.is_aimed(i) for i in numbers)
     before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
     after = [p.ahead_m for p in contacts.places[first:]]
     if contacts.aimed:
-        height = task.platform_m
-        n_initial = len(contacts.first)
-        aimed = [contacts.is_aimed(n_initial + i) for i in range(len(contacts.places))]
-        first = aimed.index(True)
-        before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
         after = [before[-1] + task.distance_m]
     toes = float(body.places[:, 0].mean())
     length = 2 * body.half_m
@@ -138,7 +138,7 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
     arriving = toes + min(after) - length
     room = 2 * limits.edge_before_heel_m
     if arriving - leaving < room:
-        phase, _ = contacts.landings[len(contacts.first) + first]
+        phase, _ = contacts.landings[n_initial + first]
         number = "distance_m" if contacts.aimed else "ahead_m"
         from_here = before[-1] if contacts.aimed else 0.0
         bound = float(np.ceil(100 * (max(before) + room + length - from_here) - 1e-6) / 100)
