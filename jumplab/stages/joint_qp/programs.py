@@ -316,9 +316,8 @@ def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
     """The posture (nq,) that the joints lean towards: ``q0`` (nq,) with the shoulders at
     ``arm_rad`` about +y.
     """
-    robot = body.robot
     q = q0.copy()
-    for name, row, sign in robot.role_signs():
+    for name, row, sign in body.robot.role_signs():
         if SAGITTAL_JOINTS[row] == "shoulder":
             q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * sign
     return q

@@ -208,10 +208,9 @@ class SrmpPlanner:
         data = parameters(task, self.reach, start)
         weights = self.changes.spread(self.nlp.problem, weights)
         if near is not None:
-            known = near.solution
-            options = dict(weights=weights, multipliers=known.multipliers, explain=False)
+            options = dict(weights=weights, multipliers=near.solution.multipliers, explain=False)
             with suppress(SolverError):  # as if there had been none
-                solution = self._warm.solve(data, known.guess(), **options)
+                solution = self._warm.solve(data, near.solution.guess(), **options)
                 return sample_plan(task, solution, self.reach)
         guess = naive_guess(task, self.reach, self.settings)
         return sample_plan(task, self.nlp.solve(data, guess, weights=weights), self.reach)

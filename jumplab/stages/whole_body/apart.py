@@ -33,9 +33,8 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
     phase = np.repeat(np.arange(len(phases)), [len(t) for t in at])
     node = np.concatenate([np.arange(len(t)) / SAMPLES for t in at])
     last = [len(p.t) - 1 for p in phases]
-    tree = body.robot.model
     pairs = zip(phases, at, strict=True)
-    charts = np.concatenate([p.sample(t)[0][:, : tree.nv] for p, t in pairs])
+    charts = np.concatenate([p.sample(t)[0][:, : body.robot.model.nv] for p, t in pairs])
     motion = configurations(body.model, charts)
     boxes = placed(body, motion)
     out: list[Apart] = []

@@ -206,7 +206,6 @@ def _curves(
     from scipy.ndimage import gaussian_filter1d  # slow to import
 
     body = schedule.body
-    phases = schedule.contacts.phases
     fine = np.linspace(0, starts[-1], SAMPLES)
     at, path = _path(schedule, task, starts)
     x, y, yaw, up = (
@@ -217,7 +216,7 @@ def _curves(
     pitch = np.full_like(fine, body.stance[5])
     arms = np.zeros_like(fine)
     back, left, middle, landed = ARMS
-    for k, p in enumerate(phases):
+    for k, p in enumerate(schedule.contacts.phases):
         if not p.flying:
             continue
         begin, end = starts[k : k + 2]
@@ -375,8 +374,7 @@ def guess(schedule: Schedule, task: JumpTask, motion: Motion) -> dict[str, Phase
     """
     body = schedule.body
     holds = footholds(schedule, task)
-    starts = motion.starts
-    times = [np.linspace(*starts[k : k + 2], len(q)) for k, q in enumerate(motion.charts)]
+    times = [np.linspace(*motion.starts[k : k + 2], len(q)) for k, q in enumerate(motion.charts)]
     t, once = np.unique(np.concatenate(times).round(9), return_index=True)
     q = np.concatenate(motion.charts)[once]
     v = np.clip(np.gradient(q, t, axis=0), -RATE_BOX, RATE_BOX)

@@ -190,8 +190,7 @@ def from_solved(program: Program, solved: Solved) -> Beginning:
         ratio = count / solved.schedule.contacts.phases[x.phase].intervals
         last = min(count, math.ceil(ratio * x.last))
         apart.append(replace(x, first=max(1, int(ratio * x.first)), last=last))
-    solution = solved.solution
-    return Beginning(solution.guess(intervals), solution.multipliers, tuple(apart))
+    return Beginning(solved.solution.guess(intervals), solved.solution.multipliers, tuple(apart))
 
 
 def unpassed(program: Program, asked: Asked, rows: Sequence[Apart]) -> Beginning:

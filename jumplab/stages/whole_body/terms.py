@@ -202,8 +202,7 @@ def over_block(m: Mode, over: tuple[float, float, float], beside_m: float) -> Te
     lim = m.limits
     first, last, top = over
     middle = float(body.places[:, 0].mean()) + (first + last) / 2
-    smooth = lim.edge_smoothing_m
-    beyond = max(min(lim.edge_step_m / 2, ROOF_HIGH * beside_m), smooth)
+    beyond = max(min(lim.edge_step_m / 2, ROOF_HIGH * beside_m), lim.edge_smoothing_m)
     half = (last - first) / 2 + beyond  # of the part that is at least as high as the block
     slope = max(ROOF_ENDS * beside_m - beyond, 2 * half)  # steeper, its ridge is out of reach
     face = body.shank_m + lim.clearance_m
@@ -215,7 +214,7 @@ def over_block(m: Mode, over: tuple[float, float, float], beside_m: float) -> Te
         spots += [((body.feet[side], x), lim.clearance_m) for x in np.concatenate(sole)]
 
     def roof(x):
-        share = 1 - (ca.sqrt((x - middle) ** 2 + smooth**2) - half) / slope
+        share = 1 - (ca.sqrt((x - middle) ** 2 + lim.edge_smoothing_m**2) - half) / slope
         return (share + ca.sqrt(share**2 + ROOF_ROUND**2)) / 2
 
     def heights(p):
@@ -598,7 +597,6 @@ def rates_within(m: Mode, rates: float, vertical: Sequence[float]) -> tuple[Call
 
 def touchdown_feet(m: Mode) -> list[Term]:
     """Both feet in their new places, flat, without spin or slip."""
-    lim = m.limits
     free = m.free
     body = m.body
     turning = [1] if free.plane else [0, 1, 2]
@@ -623,11 +621,11 @@ def touchdown_feet(m: Mode) -> list[Term]:
         rows = []
         for side in free.sides:
             speed = p.tree.point_velocity(body.feet[side], body.middles[side])
-            rows.append(np.sign(m.edges[:, :2]) @ speed[:2] - lim.touchdown_slope * speed[2])
+            rows.append(np.sign(m.edges[:, :2]) @ speed[:2] - m.limits.touchdown_slope * speed[2])
         return ca.vertcat(*rows)
 
     vertical = np.eye(3)[2][turning].tolist() * len(free.sides)
-    spin = rates_within(m, lim.touchdown_foot_rate, vertical)
+    spin = rates_within(m, m.limits.touchdown_foot_rate, vertical)
     sticks = "soles that stick at touchdown", "ours: friction", "m/s", "end"
     return [
         Term("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", "end", goal),
@@ -659,9 +657,8 @@ def capture_rows(m: Mode) -> list[Term]:
         caught = p.sole_middle - p.com - ahead - lim.capture_slope_s * p.flight("vel")
         return caught[[k for k in m.free.places if k < 2]]
 
-    window = lim.capture_window_m
     words = "capture window", f"ours; {CAPTURE}", "m", "end"
-    return [limit(*words, capture, -window, window, scale=PLACE_SCALE)]
+    return [limit(*words, capture, -lim.capture_window_m, lim.capture_window_m, scale=PLACE_SCALE)]
 
 
 def about(m: Mode, p: Instant, place: ca.SX) -> ca.SX:
