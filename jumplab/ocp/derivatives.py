@@ -230,8 +230,7 @@ class Formulator:
         inner = 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))
         variables = dict.fromkeys(("node", "start", "end"), ca.vertcat(constants, state))
         variables["interval"] = ca.vertcat(constants, state, jerk, right)
-        data = ca.vertcat(s, refs, share)
-        return variables, data, seen, {"node": step * inner, "mid": step}
+        return variables, ca.vertcat(s, refs, share), seen, {"node": step * inner, "mid": step}
 
     def _ends(self) -> tuple:
         """The same of both ends of all phases, for terms that join them."""
