@@ -153,7 +153,7 @@ def _functions_of(formulator: Formulator, part: Part, words: list, key: str | No
         return formulator.formulas(part).functions()
     fresh = {}
 
-    def make() -> dict[str, str]:
+    def make():
         fresh.update(formulator.formulas(part).functions())
         return {name: f.serialize() for name, f in fresh.items()}
 
