@@ -53,8 +53,7 @@ class Track:
         none = np.zeros_like(value)
         ends = [(value - self.value[0], none), (rate - self.rate[0], none), (none, none)]
         end = min(blend_s, self.t[-1])
-        since = np.minimum(self.t, end).reshape(-1, *[1] * none.ndim)
-        offset, drift, _ = quintic(ends, end, since)
+        offset, drift, _ = quintic(ends, end, np.minimum(self.t, end).reshape(-1, *[1] * none.ndim))
         return Track(self.t, self.value + offset, self.rate + drift)
 
 

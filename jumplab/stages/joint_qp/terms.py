@@ -228,7 +228,7 @@ def changed_problem(
         In one sentence with the term's name, before anything is solved.
     """
 
-    def look(problem: Problem, phase: str, term: Term, who: str) -> str:
+    def look(problem, phase, term, who):
         rest = body.terms(q0, np.zeros(body.nv))
         _look(term, who, StepPoint(body, FIRST[phase], rest, 0.0))
         return ""

@@ -147,7 +147,7 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
         leg=0.94 * length,
     )
 
-    def leaning(duration: float, first: float, last: float, intervals: int) -> PhaseGuess:
+    def leaning(duration, first, last, intervals):
         q = np.tile(envelope.start, (intervals + 1, 1))
         q[:, 0] += lean * np.linspace(first, last, intervals + 1) ** 2
         return PhaseGuess(duration, q, 0 * q, 0 * q)
@@ -227,13 +227,11 @@ def sample_plan(
     """Sample a stage-1 solution at times (n,) since launch and flight began [s], by default on
     grids that include both ends.
     """
-    flat, toe, flight = (solution.phases[k] for k in ("flat", "toe", "flight"))
+    flat, toe, flight = solution.phases.values()
     t = grid(flat.duration + toe.duration) if launch_t is None else launch_t
     first = t < flat.duration
     later = np.minimum(t[~first] - flat.duration, toe.duration)
-    motion = (
-        np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True)
-    )
+    motion = np.concatenate([flat.sample(t[first]), toe.sample(later)], axis=1)
     launch = SrmpStance(*on_ground(envelope.mass, task.gravity, t, *motion))
     t = grid(flight.duration) if flight_t is None else flight_t
     flown = _sample_flight(flight, toe.q[-1, 1], task.gravity, t)

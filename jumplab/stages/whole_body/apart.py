@@ -135,8 +135,7 @@ def face_gaps(one: Placed, other: Placed) -> np.ndarray:
 
 def runs(rows: np.ndarray, gap: int = 1) -> list[np.ndarray]:
     """Parts of rising numbers (n,) that follow each other with no ``gap`` wider than that."""
-    parts = np.split(rows, np.flatnonzero(np.diff(rows) > gap) + 1)
-    return [x for x in parts if len(x)]
+    return [x for x in np.split(rows, np.flatnonzero(np.diff(rows) > gap) + 1) if len(x)]
 
 
 def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:
@@ -149,8 +148,7 @@ def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:
     for x in new:
         key = x.phase, x.pair.key
         if y := out.get(key):
-            inside = x.first + NODES >= y.first and x.last - NODES <= y.last
-            more = y.more_m + MORE_M * inside
+            more = y.more_m + MORE_M * (x.first + NODES >= y.first and x.last - NODES <= y.last)
             x = replace(x, first=min(x.first, y.first), last=max(x.last, y.last), more_m=more)
         out[key] = x
     return tuple(out.values())

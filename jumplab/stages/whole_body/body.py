@@ -195,11 +195,8 @@ class Body:
 
     def _shapes_of(self, bodies: set[int]) -> list[tuple[Box, np.ndarray]]:
         """Boxes of some bodies, each with the way from its middle to its far end (3,) [m]."""
-        return [
-            (x, x.axes[:, np.argmax(x.half)] * x.half.max())
-            for x in self.shapes
-            if x.body in bodies
-        ]
+        boxes = (x for x in self.shapes if x.body in bodies)
+        return [(x, x.axes[:, np.argmax(x.half)] * x.half.max()) for x in boxes]
 
     @cached_property
     def _shins(self) -> list[int]:

@@ -84,16 +84,17 @@ def surface_of_jump(body: Body, limits: Limits, task: JumpTask) -> Surface:
     turn = pin.rpy.rpyToMatrix(0.0, 0.0, task.yaw_rad)[:2, :2]
     along = Surface(along_rad=task.along_rad).along
     corners = (body.places[:, None] + foot.corners - foot.tip).reshape(-1, 3)[:, :2]
-    landed = [task.distance_m, task.side_m] + corners @ turn.T
+    way = np.array([task.distance_m, task.side_m])
     leaving = float((corners @ along).max())
-    arriving = float((landed @ along).min())
+    arriving = float(((way + corners @ turn.T) @ along).min())
     apart = arriving - leaving - limits.edge_before_heel_m
     if task.platform_m and apart < -1e-9:  # rounding
-        way = float(np.hypot(task.distance_m, task.side_m))
-        least = float(np.ceil(100 * (way - apart) - 1e-6) / 100)
+        length = float(np.hypot(*way))
+        least = float(np.ceil(100 * (length - apart) - 1e-6) / 100)
         raise InfeasibleError(
-            f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would "
-            f"meet under a sole of {body.robot.name}; the distance must be at least {least:.2f} m",
+            f"platform = {task.platform_m:g} m at a distance of {length:g} m: the two surfaces "
+            f"would meet under a sole of {body.robot.name}; the distance must be at least "
+            f"{least:.2f} m",
             number="distance_m",
             bound=least,
         )

@@ -130,8 +130,7 @@ class Instant:
     @property
     def soles(self) -> list[ca.SX]:
         """Middles (3,) of the soles that have rows of their own [m]."""
-        body = self._mode.body
-        return [self.tree.point(body.feet[k], body.middles[k]) for k in self._mode.free.sides]
+        return [self.point(f"{SIDES[k]}_sole") for k in self._mode.free.sides]
 
     @property
     def sole_middle(self) -> ca.SX:

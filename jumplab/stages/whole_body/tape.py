@@ -281,7 +281,7 @@ def _balanced(
     seen = np.array([[0.0, 0.0, 0.0, *across]]) if line else np.eye(BASE)
     data = robot.model.createData()
 
-    def missing(change: np.ndarray | float = 0.0, rows: np.ndarray = every) -> np.ndarray:
+    def missing(change=0.0, rows=every):
         moved = motion[:, rows]
         moved[2, :, :BASE] += change
         held = legs.held(moved, holds, raised)
@@ -290,7 +290,7 @@ def _balanced(
         force, about = np.split(np.array(need) - wrench[rows], 2, axis=1)
         return np.hstack([force, about - np.cross(edge[:3], force)]) @ seen.T
 
-    def integrated(more: np.ndarray) -> np.ndarray:
+    def integrated(more):
         rate = cumulative_trapezoid(more, t, axis=0, initial=0.0)
         return np.array([cumulative_trapezoid(rate, t, axis=0, initial=0.0), rate, more])
 
@@ -346,7 +346,7 @@ def _flight(
     none = np.zeros(model.joints)
     near = planned[0][:, 3:BASE]
 
-    def fallen(change: np.ndarray, rows: slice = slice(None)) -> tuple[np.ndarray, ...]:
+    def fallen(change, rows=slice(None)):
         """The motion if joints and their rates end with a change (2 joints,)."""
         shift, rate = np.split(change, 2)
         bends = quintic([(none, shift), (none, rate), (none, none)], since[-1], since[:, None])
@@ -374,7 +374,7 @@ def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[...
     anchors = on_feet(body.robot, np.zeros(3))
     feet = [anchors[side] for side in sides]
 
-    def slopes(q: np.ndarray) -> np.ndarray:
+    def slopes(q):
         """(6 k, nv) of the feet's twists, in their axes."""
         pin.computeJointJacobians(tree, data, q)
         return np.vstack([foot.slope(tree, data, LOCAL) for foot in feet])
@@ -383,7 +383,7 @@ def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[...
     speeds = slopes(q) @ v
     goals = {foot: foot.place(data) for foot in feet}
 
-    def missed(q: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+    def missed(q, v, _):
         there, _ = bring_feet(tree, data, q[0], goals, give)
         rows = slopes(there)
         rates = least_motion(rows, speeds - rows @ v[0], give)
@@ -409,9 +409,7 @@ def falling(robot: Robot, model: SpatialModel, end: np.ndarray) -> Callable[...,
     spin = momentum.angular.copy()
     down = tree.gravity.linear
 
-    def motion(
-        joints: np.ndarray, t: np.ndarray, near: np.ndarray, rows: slice = slice(None)
-    ) -> tuple[np.ndarray, ...]:
+    def motion(joints, t, near, rows=slice(None)):
         zero = np.zeros((len(t), 3))
         turned = _turned(model, joints, spin, end[0, 0, 3:BASE], t, near)
         levels = zip((*turned, zero), joints, strict=True)

@@ -380,7 +380,8 @@ def torsion(m: Mode, side: int) -> Term:
     def left(p):
         force, moment = (x / m.body.mg for x in p.pressed(side))
         twist = ca.dot(force, moment)  # that moment times the load
-        return ca.vertcat(arm * force[2] ** 2 - twist, arm * force[2] ** 2 + twist)
+        most = arm * force[2] ** 2
+        return ca.vertcat(most - twist, most + twist)
 
     words = f"spin of {SIDES[side]} foot", "ours: friction", "m, of the squared weight", "node"
     return limit(*words, left, -TORSION_SLACK_M, scale=MOMENT_ARM_M / 10, group="torsion")
@@ -553,8 +554,8 @@ def landing_posture(m: Mode, bent: tuple[float, float]) -> list[Term]:
     lim = m.limits
     free = m.free
     angles = [free.free[k] - 3 for k in free.turns]
-    low = np.array([-lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]])[angles]
-    high = np.array([lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]])[angles]
+    yaw, roll = lim.touchdown_yaw, lim.touchdown_roll
+    low, high = np.array([(-yaw, yaw), (-roll, roll), lim.touchdown_pitch])[angles].T
 
     def attitude(p):
         return (p.attitude - ca.vertcat(p.p.yaw, 0, p.p.rotation))[angles]
