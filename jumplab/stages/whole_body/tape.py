@@ -393,8 +393,8 @@ def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[...
 
 
 def falling(robot: Robot, model: SpatialModel, end: np.ndarray) -> Callable[..., tuple]:
-    """What the base of a ``robot``, whose model feels gravity, does in free fall from an ``end``
-    (3, 1, nv) of a motion while the joints move.
+    """Free fall of a ``robot``, whose model feels gravity, from an ``end`` (3, 1, nv) of a motion,
+    by what its joints do then.
 
     The function takes angles, rates and accelerations of the joints (3, n, joints), their times t
     (n,) [s], angles (n, 3) near those of the base, and which rows (m,) are asked for; it returns
