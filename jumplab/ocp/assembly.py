@@ -128,9 +128,7 @@ class Assembled:
         It has no direction of negative curvature, and costs a fraction of the exact one.
         """
         exact = self.hess_lag
-        given = x, p, lam_f, _ = [
-            ca.MX.sym(exact.name_in(i), exact.sparsity_in(i)) for i in range(exact.n_in())
-        ]
+        given = x, p, lam_f, _ = exact.mx_in()
         held = lam_f * self.gauss_newton(x, p) + hold * ca.DM.eye(self.size)
         return ca.Function("nlp_hess_l", given, [held], exact.name_in(), exact.name_out())
 
@@ -198,8 +196,7 @@ class Block:
 
     def __call__(self, name: str, *more: ca.MX) -> list[ca.MX]:
         """All outputs of one of the functions, a matrix per node side by side."""
-        f = self.functions[name].map(len(self.index))
-        return f.call([*self.inputs, *more])
+        return self.functions[name].map(len(self.index)).call([*self.inputs, *more])
 
     def _entries(self, name: str, *more: ca.MX) -> tuple[ca.MX, np.ndarray, np.ndarray]:
         """(values, local rows, columns in x) of a matrix's entries at all nodes, (n, entries)."""

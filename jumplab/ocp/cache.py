@@ -119,8 +119,7 @@ def remembered(words: list, key: str, make: Callable[[], Any]) -> Any:
     # a folder that cannot be written, or that others can write, is no reason to fail
     with suppress(OSError, InputError):
         reading.require_private(place, place.lstat())
-        content = hashlib.sha256(body).hexdigest().encode() + b"\n" + body
-        write_file(path, content, mode=0o600)
+        write_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, mode=0o600)
     return data
 
 
@@ -152,10 +151,9 @@ def _functions_of(formulator: Formulator, part: Part, words: list, key: str | No
     """The functions of a part, from the cache or built."""
     if key is None:
         return formulator.formulas(part).functions()
+    fresh = {}
 
-    fresh: dict[str, ca.Function] = {}
-
-    def make() -> dict[str, str]:
+    def make():
         fresh.update(formulator.formulas(part).functions())
         return {name: f.serialize() for name, f in fresh.items()}
 

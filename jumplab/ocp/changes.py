@@ -70,7 +70,7 @@ def changed(
                 f"cannot be switched off"
             )
 
-    def kept(owner: str, items: tuple) -> tuple:
+    def kept(owner, items):
         """Those that are not left out, with the weights that are asked for."""
         remaining = []
         for x in items:

@@ -116,8 +116,7 @@ def _violated(a: Assembled, posed: Posed, x: np.ndarray) -> tuple[str, ...]:
                 at = phases[rows.owner].t[rows.nodes[most.argmax()]]
                 text += f" at t = {at:.3f} s of the phase"
             worst.append((amount, text))
-    ranked = sorted(worst, key=lambda entry: -entry[0])
-    return tuple(text for _, text in ranked[:NAMED])
+    return tuple(text for _, text in sorted(worst, key=lambda entry: -entry[0])[:NAMED])
 
 
 def _least_violation(a: Assembled, posed: Posed, seconds: float) -> tuple[np.ndarray, ...]:

@@ -97,7 +97,7 @@ def parts(problem: Problem) -> list[Part]:
     """All places of a problem that have terms, in order; terms of one group stand together."""
     out = []
 
-    def add(owner: str, place: str, terms: Sequence[Term]) -> None:
+    def add(owner, place, terms):
         for group in dict.fromkeys(t.group for t in terms):
             out.append(Part(owner, place, tuple(t for t in terms if t.group == group)))
 
@@ -230,8 +230,7 @@ class Formulator:
         inner = 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))
         variables = dict.fromkeys(("node", "start", "end"), ca.vertcat(constants, state))
         variables["interval"] = ca.vertcat(constants, state, jerk, right)
-        data = ca.vertcat(s, refs, share)
-        return variables, data, seen, {"node": step * inner, "mid": step}
+        return variables, ca.vertcat(s, refs, share), seen, {"node": step * inner, "mid": step}
 
     def _ends(self) -> tuple:
         """The same of both ends of all phases, for terms that join them."""
@@ -276,7 +275,7 @@ def chain_term(phase: Phase) -> Term:
     Without jerk variables it is a linear acceleration, of the integrated coordinates alone.
     """
 
-    def missed(left: Point, right: Point, step: ca.SX) -> ca.SX:
+    def missed(left, right, step):
         reached = chain(left.q, left.v, left.a, left.j, step)
         pairs = zip("qva", (right.q, right.v, right.a), reached, strict=True)
         place, rate, accel = ((there - x) / phase.scale(key) for key, there, x in pairs)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +42,7 @@ def layouts(problem: Problem) -> dict[str, PhaseLayout]:
     """
     index: dict[tuple, int] = {}
 
-    def places(keys: Iterable[tuple]) -> list[int]:
+    def places(keys):
         return [index.setdefault(key, len(index)) for key in keys]
 
     out: dict[str, PhaseLayout] = {}

@@ -105,8 +105,7 @@ class Qp:
         self.limits[name] = self._block(name, matrix, low, high, None, labels)
 
     def _block(self, name, matrix, low, high, weight, labels) -> Block:
-        matrix = np.asarray(matrix, float)
-        matrix = matrix if matrix.ndim == 2 else np.atleast_2d(matrix)
+        matrix = np.atleast_2d(np.asarray(matrix, float))
         size = len(matrix)
         labels = tuple(labels) or NUMBERS[:size]
         below = _column(low, size)
@@ -121,8 +120,7 @@ class Qp:
         weight = [b.weight for b in self.costs.values()]
         weighted = rows * np.concatenate([np.zeros(0), *weight])[:, None]
         equal, value, _ = self._joined(self.equalities)
-        limits = self._joined(self.limits)
-        return weighted.T @ rows, -weighted.T @ target, equal, value, *limits
+        return weighted.T @ rows, -weighted.T @ target, equal, value, *self._joined(self.limits)
 
     def _joined(self, blocks: dict[str, Block]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Matrix (m, n), low and high (m,) of several blocks, one below the other."""

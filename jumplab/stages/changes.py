@@ -4,6 +4,7 @@ refused in words.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
@@ -46,10 +47,10 @@ class StageChanges:
         """
         if not self:
             return problem
-        terms: dict[str, list[Term]] = {}
+        terms = defaultdict(list)
         for phase, extra in self.terms.items():
             for owner, term in _placed(problem, phase or problem.name, extra):
-                terms.setdefault(owner, []).append(term)
+                terms[owner].append(term)
         problem = changed(problem, terms, look=look)
         weights = self.spread(problem, self.weights)
         return changed(problem, weights=weights, off=self.spread(problem, dict.fromkeys(self.off)))
@@ -102,8 +103,7 @@ def sorted_out(
         it must be.
     """
     by_stage = {stage: ({}, {}, {}) for stage in PHASES}  # own terms, weights, switches
-    terms = {} if terms is None else terms
-    weights = {} if weights is None else weights
+    terms, weights = ({} if x is None else x for x in (terms, weights))
     require_type(terms, Mapping, "own terms")
     require_type(weights, Mapping, "weights")
     if isinstance(off, str) or not isinstance(off, Iterable):

@@ -257,12 +257,11 @@ def planned(tape: Tape) -> dict[str, float]:
     flights = [height[rows] for rows in tape.flights] or [height]
     rise, apex = max((float(x.max() - x[0]), float(x.max())) for x in flights)
     ahead, left, _ = extra["soles_travel"].tolist()
-    aside = {"planned_side_m": left, "planned_yaw_rad": float(extra["feet_turn"])}
+    high = {"planned_rise_m": rise, "planned_apex_m": apex - float(height[0])}
     if "planar_toe" in extra:
         toe = extra["planar_toe"]
-        ahead = float(toe[-1, 0] - toe[0, 0])
-        aside = {}
-    high = {"planned_rise_m": rise, "planned_apex_m": apex - float(height[0])}
+        return {"planned_distance_m": float(toe[-1, 0] - toe[0, 0]), **high}
+    aside = {"planned_side_m": left, "planned_yaw_rad": float(extra["feet_turn"])}
     return {"planned_distance_m": ahead, **high, **aside}
 
 

@@ -139,11 +139,9 @@ class Planner(Shown):
     def _settings(self, kind: type, flip: bool) -> Any:
         """Limits, stage 1's settings or mesh, of jumps or of flips."""
         given = self._given[kind]
-        return (
-            given
-            if kind is Mesh and isinstance(given, Mesh)
-            else settled(kind, given, flip, self._size)
-        )
+        if kind is Mesh and isinstance(given, Mesh):
+            return given
+        return settled(kind, given, flip, self._size)
 
     @property
     def limits(self) -> Limits:
@@ -378,8 +376,7 @@ class Planner(Shown):
         asked = self.prepared(method, weights, task)
         begin = {"weights": asked[LAST].weights}
         if start is not None:  # the middle of the soles is at the origin
-            toe = -self.robot.sagittal.sole_center
-            begin["stance"] = configuration(self.robot, start, toe=toe)
+            begin["stance"] = configuration(self.robot, start, toe=-self.robot.sagittal.sole_center)
         if near is not None:
             begin["near"] = near.whole_body
         if method == "direct":
@@ -438,8 +435,7 @@ class Planner(Shown):
                 f"({previous.robot.hash}), not for {self.robot.name} ({self.robot.hash}); "
                 f"give a plan of this robot"
             )
-        body = previous.whole_body
-        phases = [] if body is None else body.schedule.contacts.phases
+        phases = [] if previous.whole_body is None else previous.whole_body.schedule.contacts.phases
         other = phases != self.direct(task).contacts.phases
         near = None if task.rotation_rad or other else previous
         return self.plan(task, previous.method, start=start, near=near)
@@ -481,8 +477,7 @@ class Planner(Shown):
         asked = sorted_out(weights=weights)[LAST]
         # a schedule has its own places; of a target only gravity and rise are taken
         level = JumpTask(0.0, rise_m, gravity=gravity)
-        costs = settled(Weights, None, size=self._size)
-        settings = {"limits": self.limits, "weights": costs}
+        settings = {"limits": self.limits, "weights": settled(Weights, None, size=self._size)}
         options = {}
         if motion is not None:  # clips are of robots of one size, on which their numbers were found
             limits = replace(Limits().of_clip(), **named(Limits, self._given[Limits]))

@@ -53,8 +53,7 @@ class Track:
         none = np.zeros_like(value)
         ends = [(value - self.value[0], none), (rate - self.rate[0], none), (none, none)]
         end = min(blend_s, self.t[-1])
-        since = np.minimum(self.t, end).reshape(-1, *[1] * none.ndim)
-        offset, drift, _ = quintic(ends, end, since)
+        offset, drift, _ = quintic(ends, end, np.minimum(self.t, end).reshape(-1, *[1] * none.ndim))
         return Track(self.t, self.value + offset, self.rate + drift)
 
 
@@ -316,9 +315,8 @@ def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
     """The posture (nq,) that the joints lean towards: ``q0`` (nq,) with the shoulders at
     ``arm_rad`` about +y.
     """
-    robot = body.robot
     q = q0.copy()
-    for name, row, sign in robot.role_signs():
+    for name, row, sign in body.robot.role_signs():
         if SAGITTAL_JOINTS[row] == "shoulder":
             q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * sign
     return q

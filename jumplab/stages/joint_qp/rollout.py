@@ -245,8 +245,9 @@ class JointMapper:
             time.perf_counter() - began,
             max(rows.residual),
         )
-        fields = dict(statistics=statistics, options=self.options, problem=self.problem)
-        return JointPlan(**columns, **fields)
+        return JointPlan(
+            **columns, statistics=statistics, options=self.options, problem=self.problem
+        )
 
 
 def map_to_joints(

@@ -179,8 +179,7 @@ def flight_terms(o: Options) -> list[Term]:
 
     def ground(p):
         x = p.quantities
-        rows = p.affine(x.vertical("jacobian"), x.vertical("drift"))
-        return rows.named(_both(["toe", "heel"]))
+        return p.affine(x.vertical("jacobian"), x.vertical("drift")).named(_both(["toe", "heel"]))
 
     def least(p):
         return p.target.floor
@@ -205,8 +204,8 @@ def flight_terms(o: Options) -> list[Term]:
 def build_problem(options: Options = Options()) -> Problem:
     """Both QPs as one problem of two phases, each with one step."""
     parts = {"launch": launch_terms(options), "flight": flight_terms(options)}
-    phases = (Phase(name, (), 1, (0.0, 1.0), tuple(terms)) for name, terms in parts.items())
-    return Problem("joint qp", tuple(phases))
+    phases = tuple(Phase(name, (), 1, (0.0, 1.0), tuple(x)) for name, x in parts.items())
+    return Problem("joint qp", phases)
 
 
 def changed_problem(
@@ -229,7 +228,7 @@ def changed_problem(
         In one sentence with the term's name, before anything is solved.
     """
 
-    def look(problem: Problem, phase: str, term: Term, who: str) -> str:
+    def look(problem, phase, term, who):
         rest = body.terms(q0, np.zeros(body.nv))
         _look(term, who, StepPoint(body, FIRST[phase], rest, 0.0))
         return ""

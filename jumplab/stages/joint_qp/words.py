@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import numpy as np
 
 from jumplab.errors import SolverError
@@ -53,12 +55,12 @@ def giving(phase: Phase, clash: Conflict) -> tuple[str, ...]:
     (row, row)".
     """
     units = {term.name: term.unit.split(", ") for term in phase.terms}
-    groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
+    groups = defaultdict(list)
     for name, row, amount in clash.gives:
         kinds = units.get(name, [""])
         axis = row.split()[-1]
         unit = kinds[-1 if axis in AXES[3:] else 0] if axis in AXES else " or ".join(kinds)
-        groups.setdefault((name, unit), []).append((amount, row))
+        groups[name, unit].append((amount, row))
     return tuple(
         f"'{_words(phase, name)}' by {f'{max(rows)[0]:.3g} {unit}'.strip()} "
         f"({', '.join(sorted(row for _, row in rows))})"
@@ -68,9 +70,9 @@ def giving(phase: Phase, clash: Conflict) -> tuple[str, ...]:
 
 def holding(phase: Phase, clash: Conflict) -> list[str]:
     """Which limits stand against it, one entry per term."""
-    names: dict[str, list[str]] = {}
+    names = defaultdict(list)
     for name, row in clash.limits:
-        names.setdefault(name, []).append(row)
+        names[name].append(row)
     return [f"{_words(phase, name)} ({', '.join(sorted(rows))})" for name, rows in names.items()]
 
 

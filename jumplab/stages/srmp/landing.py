@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from operator import itemgetter
 from typing import Any
 
 import casadi as ca
@@ -198,9 +199,7 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
     """
     base = SrmpSettings()
     free = np.inf
-
-    def start(parameters):
-        return parameters["start"]
+    start = itemgetter("start")  # of the parameters
 
     def rates(sign):
         return lambda parameters: np.array([*parameters["rates"], sign * free, sign * free])
@@ -246,7 +245,7 @@ class LandingPlanner:
         """
         data = self._parameters(touchdown)
         gravity = self.robot.gravity
-        solution = self.nlp.solve({**data, "gravity": gravity}, {"landing": self._guess(data)})
+        solution = self.nlp.solve(data | {"gravity": gravity}, {"landing": self._guess(data)})
         phase = solution.phases["landing"]
         t = grid(phase.duration)
         columns = on_ground(self.reach.mass, gravity, t, *phase.sample(t))

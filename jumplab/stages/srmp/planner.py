@@ -147,7 +147,7 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
         leg=0.94 * length,
     )
 
-    def leaning(duration: float, first: float, last: float, intervals: int) -> PhaseGuess:
+    def leaning(duration, first, last, intervals):
         q = np.tile(envelope.start, (intervals + 1, 1))
         q[:, 0] += lean * np.linspace(first, last, intervals + 1) ** 2
         return PhaseGuess(duration, q, 0 * q, 0 * q)
@@ -208,10 +208,9 @@ class SrmpPlanner:
         data = parameters(task, self.reach, start)
         weights = self.changes.spread(self.nlp.problem, weights)
         if near is not None:
-            known = near.solution
-            options = dict(weights=weights, multipliers=known.multipliers, explain=False)
+            options = dict(weights=weights, multipliers=near.solution.multipliers, explain=False)
             with suppress(SolverError):  # as if there had been none
-                solution = self._warm.solve(data, known.guess(), **options)
+                solution = self._warm.solve(data, near.solution.guess(), **options)
                 return sample_plan(task, solution, self.reach)
         guess = naive_guess(task, self.reach, self.settings)
         return sample_plan(task, self.nlp.solve(data, guess, weights=weights), self.reach)
@@ -228,13 +227,11 @@ def sample_plan(
     """Sample a stage-1 solution at times (n,) since launch and flight began [s], by default on
     grids that include both ends.
     """
-    flat, toe, flight = (solution.phases[k] for k in ("flat", "toe", "flight"))
+    flat, toe, flight = solution.phases.values()
     t = grid(flat.duration + toe.duration) if launch_t is None else launch_t
     first = t < flat.duration
     later = np.minimum(t[~first] - flat.duration, toe.duration)
-    motion = (
-        np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True)
-    )
+    motion = np.concatenate([flat.sample(t[first]), toe.sample(later)], axis=1)
     launch = SrmpStance(*on_ground(envelope.mass, task.gravity, t, *motion))
     t = grid(flight.duration) if flight_t is None else flight_t
     flown = _sample_flight(flight, toe.q[-1, 1], task.gravity, t)

@@ -5,6 +5,7 @@ flight, joined at take-off (Sec. III of the paper); pure, nothing here solves.
 from __future__ import annotations
 
 from functools import partial
+from operator import itemgetter
 
 import casadi as ca
 import numpy as np
@@ -56,9 +57,6 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         margin = s.inertia_margin * (high - low)
         return ca.vertcat(p.inertia - low - margin, high - margin - p.inertia)
 
-    def push(p):
-        return p.ground_force[1]
-
     def cone(p):
         f = p.ground_force
         return ca.vertcat(s.friction * f[1] - f[0], s.friction * f[1] + f[0])
@@ -71,7 +69,9 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         limit("trunk range", "SL-P1, as path", "rad", "node", "posture", *reach.posture),
         limit("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_room),
         limit("L range", "SL-P5", "kg m^2/s", "node", "L", *s.momentum, scale=10.0),
-        limit("unilateral", "ours", "N", "node", push, scale=mg, skip=(0, 1)),
+        limit(
+            "unilateral", "ours", "N", "node", lambda p: p.ground_force[1], scale=mg, skip=(0, 1)
+        ),
         limit("friction", "ours", "N", "node", cone, scale=mg, skip=(0, 1)),
         *leg_terms(mass, reach, s),
     ]
@@ -111,12 +111,10 @@ def reach_terms(reach: Reach, s: SrmpSettings, heel_up: bool) -> list[Term]:
         return p.inertia - ca.polyval(fit, p.q[1])
 
     def height(p):
-        com = p.com
-        return com[1] - slope * com[0] - offset
+        return p.com[1] - slope * p.com[0] - offset
 
     def deep(p):
-        com = p.com
-        below = ca.polyval(ca.DM(reach.easy_com_fit), com[0]) - com[1]
+        below = ca.polyval(ca.DM(reach.easy_com_fit), p.com[0]) - p.com[1]
         return (below + ca.sqrt(below**2 + s.crouch_smoothing_m**2)) / 2
 
     def between(left, right, step):
@@ -292,9 +290,7 @@ def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, P
     toe edge.
     """
 
-    def start(parameters):
-        return parameters["start"]
-
+    start = itemgetter("start")  # of the parameters
     low, high = zip(s.takeoff_lean, reach.length, s.turn_rad, s.radius_m, strict=True)
     box = Bound("state box", "SL-B1", "rad, m", "q", low, high, "inner")
     bounds = (
@@ -321,7 +317,7 @@ def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, P
 
 def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
     stance = reach.start[1]
-    (low, high) = reach.inertia
+    low, high = reach.inertia
     margin = s.inertia_margin * (high - low)
     most = min(high - margin, low + s.flight_inertia * (high - low))
     accel = s.inertia_accel
@@ -341,13 +337,12 @@ def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
         **{name: (*s.speed_m_s, 1.0) for name in ("vel_x", "vel_z")},
         "leg": (shortest, s.touchdown_length[1] * stance, 1.0),
     }
-    terms = tuple(flight_terms(s, reach))
     return Phase(
         "flight",
         ("inertia",),
         s.intervals[2],
         FLIGHT_S,
-        terms,
+        tuple(flight_terms(s, reach)),
         bounds,
         states=("theta",),
         constants=constants,

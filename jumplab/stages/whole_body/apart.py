@@ -11,6 +11,7 @@ import pinocchio as pin
 from jumplab.io.tape import Tape
 from jumplab.ocp.solution import PhaseSolution
 from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.motions import configurations
 from jumplab.stages.whole_body.shapes import Apart, Box, Pair
 
 SAMPLES = 3  # in every interval, that are looked at
@@ -32,11 +33,10 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
     phase = np.repeat(np.arange(len(phases)), [len(t) for t in at])
     node = np.concatenate([np.arange(len(t)) / SAMPLES for t in at])
     last = [len(p.t) - 1 for p in phases]
-    tree = body.robot.model
     pairs = zip(phases, at, strict=True)
-    charts = np.concatenate([p.sample(t)[0][:, : tree.nv] for p, t in pairs])
-    configurations = body.model.to_pinocchio(charts, 0 * charts, 0 * charts)[0]
-    boxes = placed(body, configurations)
+    charts = np.concatenate([p.sample(t)[0][:, : body.robot.model.nv] for p, t in pairs])
+    motion = configurations(body.model, charts)
+    boxes = placed(body, motion)
     out: list[Apart] = []
     for number, (i, k) in enumerate(body.candidates):
         one = boxes[i]
@@ -47,11 +47,14 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
         gaps = np.concatenate([face_gaps(one, other), face_gaps(other, one)])  # (12, n)
         # the first node is given, so that before the second one no row keeps them apart
         near = np.flatnonzero((gaps.max(axis=0) < least_m) & ((phase > 0) | (node >= 1)))
-        met = [row for row in near if _distance(body, number, configurations[row]) < least_m]
+        met = [row for row in near if _distance(body, number, motion[row]) < least_m]
         for rows in runs(np.array(met, int), 2 * NODES * SAMPLES):
             # one, or neighbouring phases ask for two
             faces = _face(gaps, rows, least_m), _face_before(gaps, rows[0], least_m)
-            pair, before = (_pair(one[0], other[0], face) for face in faces)
+            # the box with the face, of both boxes' 12, is the first
+            pair, before = (
+                Pair(one[0], other[0], k) if k < 6 else Pair(other[0], one[0], k - 6) for k in faces
+            )
             for part in np.unique(phase[rows]):
                 nodes = node[rows[phase[rows] == part]]
                 first = max(1, int(nodes.min()) - NODES)
@@ -59,11 +62,6 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
                 if first <= end:
                     out.append(Apart(int(part), first, end, pair, before=before))
     return out
-
-
-def _pair(one: Box, other: Box, face: int) -> Pair:
-    """Two boxes, the one with the ``face``, of 12, first."""
-    return Pair(one, other, face) if face < 6 else Pair(other, one, face - 6)
 
 
 def _face(gaps: np.ndarray, rows: np.ndarray, least_m: float) -> int:
@@ -108,20 +106,17 @@ def used_apart(
     return 2 - least / TOUCH_M
 
 
-def placed(body: Body, configurations: np.ndarray) -> list[Placed]:
-    """All boxes in configurations (n, nq)."""
+def placed(body: Body, motion: np.ndarray) -> list[Placed]:
+    """All boxes in the configurations of a ``motion`` (n, nq)."""
     tree = body.robot.model
     data = tree.createData()
-    places = []
-    turns = []
-    for q in configurations:
+    places = np.empty((len(motion), len(body.model.bodies), 3))
+    turns = np.empty((*places.shape, 3))
+    for k, q in enumerate(motion):
         pin.forwardKinematics(tree, data, q)
-        places.append([x.translation.copy() for x in data.oMi[1:]])
-        turns.append(
-            [x.rotation @ b.own for x, b in zip(data.oMi[1:], body.model.bodies, strict=True)]
-        )
-    places = np.array(places)
-    turns = np.array(turns)
+        places[k] = [x.translation for x in data.oMi[1:]]
+        turns[k] = [x.rotation for x in data.oMi[1:]]
+    turns @= np.array([x.own for x in body.model.bodies])
     return [
         (x, places[:, x.body] + turns[:, x.body] @ x.centre, turns[:, x.body] @ x.axes)
         for x in body.shapes
@@ -140,8 +135,7 @@ def face_gaps(one: Placed, other: Placed) -> np.ndarray:
 
 def runs(rows: np.ndarray, gap: int = 1) -> list[np.ndarray]:
     """Parts of rising numbers (n,) that follow each other with no ``gap`` wider than that."""
-    parts = np.split(rows, np.flatnonzero(np.diff(rows) > gap) + 1)
-    return [x for x in parts if len(x)]
+    return [x for x in np.split(rows, np.flatnonzero(np.diff(rows) > gap) + 1) if len(x)]
 
 
 def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:
@@ -154,8 +148,7 @@ def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:
     for x in new:
         key = x.phase, x.pair.key
         if y := out.get(key):
-            inside = x.first + NODES >= y.first and x.last - NODES <= y.last
-            more = y.more_m + MORE_M * inside
+            more = y.more_m + MORE_M * (x.first + NODES >= y.first and x.last - NODES <= y.last)
             x = replace(x, first=min(x.first, y.first), last=max(x.last, y.last), more_m=more)
         out[key] = x
     return tuple(out.values())

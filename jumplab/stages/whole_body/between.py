@@ -83,8 +83,7 @@ def _pressed_outside(tape: Tape, robot: Robot, turn: np.ndarray) -> np.ndarray:
     """
     foot = robot.foot
     force = tape.f[..., :3]
-    least = size(robot).of(PRESSED_N, "N")
-    load = np.where(force[..., 2] > least, force[..., 2], np.nan)
+    load = np.where(force[..., 2] > size(robot).of(PRESSED_N, "N"), force[..., 2], np.nan)
     moment = tape.f[..., 3:] - np.cross(turn @ foot.tip, force)
     # x + iy, from the middle of the toe edge, in the axes of the foot's heading
     ahead = turn[..., 0, 0] + 1j * turn[..., 1, 0]

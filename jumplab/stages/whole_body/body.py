@@ -54,7 +54,7 @@ class Body:
         self.tips = self._on_feet(foot.tip)
         self.middles = self._on_feet(foot.center)
         corners = [self._on_feet(x) for x in foot.corners[::-1]]
-        self.corners = np.array(corners).transpose(1, 0, 2)
+        self.corners = np.array(corners).swapaxes(0, 1)
         self.knees = knees(robot)
         self.legs = [columns.tolist() for columns in leg_columns(robot)]
         self.motors = robot.limits
@@ -84,24 +84,16 @@ class Body:
             high[k] = min(high[k], bent[1])
         return low, high
 
-    @property
-    def stops_off_rad(self) -> np.ndarray:
-        """Way (joints,) of the stance to the nearer stop of each joint."""
-        stance = self.stance[BASE:]
-        return np.minimum(stance - self.motors.lower, self.motors.upper - stance)
-
     @cached_property
     def squat_rad(self) -> float:
         """Flexion of the knees to which the hips' stops let the robot squat: hips turn by half of
         what the knees do, from the stance.
         """
         bent = min(sign * self.stance[BASE + k] + angle for k, sign, angle in self.knees)
-        rooms = []
-        for column, sign in self.hips:
-            k = column - BASE
-            stops = sign * self.motors.lower[k], sign * self.motors.upper[k]
-            rooms.append(sign * self.stance[column] - min(stops))
-        return float(bent + 2 * min(rooms))
+        columns, signs = np.array(self.hips).T
+        columns = columns.astype(int)
+        stops = signs * [x[columns - BASE] for x in (self.motors.lower, self.motors.upper)]
+        return float(bent + 2 * (signs * self.stance[columns] - stops.min(axis=0)).min())
 
     @cached_property
     def leg_m(self) -> float:
@@ -203,11 +195,8 @@ class Body:
 
     def _shapes_of(self, bodies: set[int]) -> list[tuple[Box, np.ndarray]]:
         """Boxes of some bodies, each with the way from its middle to its far end (3,) [m]."""
-        return [
-            (x, x.axes[:, np.argmax(x.half)] * x.half.max())
-            for x in self.shapes
-            if x.body in bodies
-        ]
+        boxes = (x for x in self.shapes if x.body in bodies)
+        return [(x, x.axes[:, np.argmax(x.half)] * x.half.max()) for x in boxes]
 
     @cached_property
     def _shins(self) -> list[int]:

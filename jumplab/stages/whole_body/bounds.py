@@ -43,14 +43,14 @@ def refuse_impossible(body: Body, limits: Limits, task: JumpTask) -> None:
     """
     way = np.array([task.distance_m, task.side_m])
     length = float(np.hypot(*way))
-    asked = {
-        "height_m": ("rise", task.height_m, most(body, limits, task, "height_m")),
-        "platform_m": ("platform", task.platform_m, most(body, limits, task, "platform_m")),
-    }
+    asked = [
+        (number, word, getattr(task, number), most(body, limits, task, number))
+        for number, word in (("height_m", "rise"), ("platform_m", "platform"))
+    ]
     if length:
         number = "distance_m" if task.distance_m else "side_m"
-        asked[number] = ("travel", length, _travel(body, limits, task, way / length))
-    for number, (word, x, bound) in asked.items():
+        asked.append((number, "travel", length, _travel(body, limits, task, way / length)))
+    for number, word, x, bound in asked:
         if x > bound + ROUNDING_M:
             rise = "" if number == "height_m" else f" with a rise of {task.height_m:g} m"
             raise InfeasibleError(

@@ -5,6 +5,7 @@ schedules have names.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -176,8 +177,8 @@ class Contacts:
                 f"phase {first.name!r}: a schedule must begin at rest on flat feet, where the "
                 f"robot can wait; begin with 'LR'"
             )
-        names = [p.name for p in phases]
-        if twice := sorted({n for n in names if names.count(n) > 1}):
+        counts = Counter(p.name for p in phases)
+        if twice := sorted(name for name, count in counts.items() if count > 1):
             yield f"two phases are called {twice[0]!r}; names must be unique in a schedule"
         if self.over and not (self.over[0] < self.over[1] and self.over[2] > 0):
             yield f"over = {self.over}: give (from, to, top) of a block [m], from < to and top > 0"
@@ -195,8 +196,7 @@ class Contacts:
                 f"the {SIDES[1 - side]} one; begin with 'LR'"
             )
         before = [{}, *(p.modes for p in phases)]
-        pairs = enumerate(zip(before, phases, strict=False))
-        landings = [(k, side) for k, (old, p) in pairs for side in p.modes if side not in old]
+        landings = [(k, s) for k, p in enumerate(phases) for s in p.modes if s not in before[k]]
         object.__setattr__(self, "landings", tuple(landings))
         if self.first and len(self.first) != len(first.modes):
             yield (
@@ -253,11 +253,8 @@ class Contacts:
         """Numbers of the flights after which both feet come down flat, where the robot is to be
         caught; none unless it goes on to fly again after one of them.
         """
-        caught = tuple(
-            k
-            for k, (p, after) in enumerate(pairwise(self.phases))
-            if p.flying and after.feet == "LR"
-        )
+        pairs = enumerate(pairwise(self.phases))
+        caught = tuple(k for k, (p, after) in pairs if p.flying and after.feet == "LR")
         return caught if caught and caught[0] < self.last_flight else ()
 
     def is_aimed(self, contact: int) -> bool:
@@ -277,13 +274,13 @@ class Contacts:
         The steps may be longer or shorter, but for those towards an edge, and those to a take-off
         off both feet, which stand side by side.
         """
-        words = _course(task.takeoff, task.run_up, task.landing)
+        words = _course(task.takeoff, task.run_up, task.landing).split()
         flight = words.index(FLIGHT)
         d = _step(robot, None)
         free = FREE_SHARE * d * (task.takeoff != "both" and not task.platform_m)
         ahead = [d * (1 + LONGER * k) for k in range(task.run_up)]
         ahead += ahead[-1:] * (task.takeoff == "both")
-        steps = [replace(Place(x), free_m=(free, Place(x).free_m[1])) for x in ahead]
+        steps = [Place(x, free_m=(free, Place.free_m[1])) for x in ahead]
         landed = Place(0.0, task.side_m)
         phases = [ContactPhase.usual(feet, robot) for feet in words]
         phases[flight] = replace(phases[flight], time_s=flight_s)
@@ -347,8 +344,7 @@ class Contacts:
         if foot not in SIDES:
             raise InputError(f"foot = {quoted(foot)}: choose {' or '.join(SIDES)}")
         place = Place(_step(robot, ahead_m))
-        words = _course(foot, 0, foot if same else "both")
-        return cls.of(" ".join(words), robot, [place, place])
+        return cls.of(_course(foot, 0, foot if same else "both"), robot, [place, place])
 
     @classmethod
     def run_up(cls, robot: Robot, steps: int = 1, step_m: float | None = None) -> Contacts:
@@ -358,7 +354,7 @@ class Contacts:
         words = _course(SIDES[steps % 2], steps, "both")
         ahead = [d * (1 + LONGER * k) for k in range(steps)]
         jump = (ahead or [0.0])[-1] + 1.6 * d
-        return cls.of(" ".join(words), robot, [Place(x) for x in (*ahead, jump, jump)])
+        return cls.of(words, robot, [Place(x) for x in (*ahead, jump, jump)])
 
     @classmethod
     def leap(cls, robot: Robot, step_m: float | None = None, *, share: float = 2.4) -> Contacts:
@@ -366,8 +362,8 @@ class Contacts:
         following; ``share`` is how many steps ahead they land.
         """
         d = _step(robot, step_m)
-        words = _course("right", 1, "left")
-        return cls.of(" ".join(words), robot, [Place(d), Place(share * d), Place(share * d)])
+        far = Place(share * d)
+        return cls.of(_course("right", 1, "left"), robot, [Place(d), far, far])
 
     @classmethod
     def hurdle(cls, robot: Robot, height_m: float = 0.0, step_m: float | None = None) -> Contacts:
@@ -400,7 +396,7 @@ class Contacts:
     def step_off(cls, robot: Robot, drop_m: float, ahead_m: float | None = None) -> Contacts:
         """Off an edge with one foot first, in flight, and down on both, ``drop_m`` [m] lower."""
         low = Place(_past_edge_m(robot, ahead_m), up_m=-drop_m)
-        return cls.of(" ".join(_course("left", 0, "both")), robot, [low, low])
+        return cls.of(_course("left", 0, "both"), robot, [low, low])
 
     @classmethod
     def drop_jump(
@@ -436,26 +432,25 @@ def jump_contacts(limits: Limits, mesh: Mesh) -> Contacts:
     return Contacts(phases, ends="touchdown")
 
 
-def _course(takeoff: str, steps: int, landing: str) -> list[str]:
-    """Words of ``steps`` from a stand, one foot after the other, a take-off and a landing, each on
-    the feet of such words as of :class:`.JumpTask`.
+def _course(takeoff: str, steps: int, landing: str) -> str:
+    """Words, as of :meth:`Contacts.of`, of ``steps`` from a stand, one foot after the other, a
+    take-off and a landing, each on the feet of such words as of :class:`.JumpTask`.
     """
-    last = SIDES.index(takeoff) if takeoff in SIDES else 0
-    words = ["LR"]
+    alone = takeoff in SIDES
+    last = SIDES.index(takeoff) if alone else 0
     # the foot that stands first, then those of the steps
     sides = [(last + steps - k) % 2 for k in range(steps + 1)]
-    if steps or takeoff in SIDES:
+    words = ["LR"]
+    if steps or alone:
         words.append("LR"[sides[0]])
     for before, side in pairwise(sides):
         words += [("lR", "Lr")[before], "LR"[side]]
-    if takeoff in SIDES:
-        words.append("lr"[last])
-    else:
-        words += ["LR", "lr"] if steps else ["lr"]
-    words.append(FLIGHT)
+    if steps and not alone:
+        words.append("LR")
+    words += ["lr"[last] if alone else "lr", FLIGHT]
     if landing in SIDES:
         words.append("LR"[SIDES.index(landing)])
-    return [*words, "LR"]
+    return " ".join([*words, "LR"])
 
 
 def _step(robot: Robot, given_m: float | None) -> float:
@@ -469,8 +464,7 @@ def _check_count(name: str, count: int, least: int) -> None:
 
 def _past_edge_m(robot: Robot, given_m: float | None) -> float:
     """Distance at which feet come down past an edge [m]: ``given_m``, or a step and the sole."""
-    foot = robot.foot
-    return _step(robot, None) + (foot.toe - foot.heel) if given_m is None else given_m
+    return _step(robot, None) + (robot.foot.toe - robot.foot.heel) if given_m is None else given_m
 
 
 def _fault_of(p: ContactPhase) -> str:

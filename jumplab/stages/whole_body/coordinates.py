@@ -101,8 +101,7 @@ class Coordinates:
         """
         if not self.even:
             return x[: self.size]
-        spread = ca.sparsify(ca.DM(self.spread))
-        return spread @ x[: self.size] + (0 if level else self.rest)
+        return ca.sparsify(ca.DM(self.spread)) @ x[: self.size] + (0 if level else self.rest)
 
     def charts(self, x: np.ndarray, level: int = 0) -> np.ndarray:
         """The same for numbers (n, free): (n, 6 + joints)."""

@@ -84,16 +84,17 @@ def surface_of_jump(body: Body, limits: Limits, task: JumpTask) -> Surface:
     turn = pin.rpy.rpyToMatrix(0.0, 0.0, task.yaw_rad)[:2, :2]
     along = Surface(along_rad=task.along_rad).along
     corners = (body.places[:, None] + foot.corners - foot.tip).reshape(-1, 3)[:, :2]
-    landed = [task.distance_m, task.side_m] + corners @ turn.T
+    way = np.array([task.distance_m, task.side_m])
     leaving = float((corners @ along).max())
-    arriving = float((landed @ along).min())
+    arriving = float(((way + corners @ turn.T) @ along).min())
     apart = arriving - leaving - limits.edge_before_heel_m
     if task.platform_m and apart < -1e-9:  # rounding
-        way = float(np.hypot(task.distance_m, task.side_m))
-        least = float(np.ceil(100 * (way - apart) - 1e-6) / 100)
+        length = float(np.hypot(*way))
+        least = float(np.ceil(100 * (length - apart) - 1e-6) / 100)
         raise InfeasibleError(
-            f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would "
-            f"meet under a sole of {body.robot.name}; the distance must be at least {least:.2f} m",
+            f"platform = {task.platform_m:g} m at a distance of {length:g} m: the two surfaces "
+            f"would meet under a sole of {body.robot.name}; the distance must be at least "
+            f"{least:.2f} m",
             number="distance_m",
             bound=least,
         )
@@ -108,14 +109,14 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
     would come down on the schedule's block; the sentence names the phase.
     """
     height, first = contacts.surface
+    n_initial = len(contacts.first)
+    if contacts.aimed:
+        height = task.platform_m
+        numbers = range(n_initial, len(contacts.landings))
+        first = sum(not contacts.is_aimed(i) for i in numbers)
     before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
     after = [p.ahead_m for p in contacts.places[first:]]
     if contacts.aimed:
-        height = task.platform_m
-        n_initial = len(contacts.first)
-        aimed = [contacts.is_aimed(n_initial + i) for i in range(len(contacts.places))]
-        first = aimed.index(True)
-        before = [0.0, *(p.ahead_m for p in contacts.places[:first])]
         after = [before[-1] + task.distance_m]
     toes = float(body.places[:, 0].mean())
     length = 2 * body.half_m
@@ -138,7 +139,7 @@ def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts, task: Ju
     arriving = toes + min(after) - length
     room = 2 * limits.edge_before_heel_m
     if arriving - leaving < room:
-        phase, _ = contacts.landings[len(contacts.first) + first]
+        phase, _ = contacts.landings[n_initial + first]
         number = "distance_m" if contacts.aimed else "ahead_m"
         from_here = before[-1] if contacts.aimed else 0.0
         bound = float(np.ceil(100 * (max(before) + room + length - from_here) - 1e-6) / 100)

@@ -35,8 +35,7 @@ class Instant:
     def tree(self) -> SpatialState:
         """All links; ``tree.q`` is the chart (6 + joints,)."""
         p = self._point
-        chart = self._mode.free.chart
-        motion = (chart(x, level) for level, x in enumerate((p.q, p.v, p.a)))
+        motion = (self._mode.free.chart(x, level) for level, x in enumerate((p.q, p.v, p.a)))
         return SpatialState(self._mode.model, *motion, p.p.gravity, self._mode.free.even)
 
     # what moves
@@ -131,8 +130,7 @@ class Instant:
     @property
     def soles(self) -> list[ca.SX]:
         """Middles (3,) of the soles that have rows of their own [m]."""
-        body = self._mode.body
-        return [self.tree.point(body.feet[k], body.middles[k]) for k in self._mode.free.sides]
+        return [self.point(f"{SIDES[k]}_sole") for k in self._mode.free.sides]
 
     @property
     def sole_middle(self) -> ca.SX:
@@ -236,11 +234,10 @@ class Instant:
         """Force of the ground on the left and on the right foot (3,) in the axes of its foothold
         [N]; zero in the air.
         """
-        mode = self._mode
         out = [ca.SX.zeros(3), ca.SX.zeros(3)]
-        for side in mode.sides:
+        for side in self._mode.sides:
             out[side] = self.pressed(side)[0]
-        if mode.free.even:
+        if self._mode.free.even:
             out[1] = ca.DM([1.0, -1.0, 1.0]) * out[0]
         return out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,8 +39,7 @@ def limit_of(
     if column < 3 * count:
         kind = ("upper stop" if way > 0 else "lower stop", "speed", None)[column // count]
         return kind and (kind, phase.coordinates[column % count])
-    name = phase.states[column - 3 * count]
-    _, of, joint = name.partition("torque of ")
+    _, of, joint = phase.states[column - 3 * count].partition("torque of ")
     return ("torque", joint) if of else None
 
 
@@ -48,17 +48,18 @@ def held_back(program: Program, failure: SolverError) -> str:
     limits; "" if none does, or if nobody looked.
     """
     phases = {p.name: p for p in program.nlp.problem.phases}
-    worth: dict[tuple[str, str], float] = {}
+    worth = Counter()
     for (owner, term), column, _, lam, limit in failure.limits:
         size = lam * np.where(np.isfinite(limit), np.abs(limit), 0.0)
         for way in (1, -1):
             key = owner in phases and limit_of(phases[owner], program, term, column, way)
             if key and key[1] in program.robot.actuators:
-                worth[key] = worth.get(key, 0.0) + float(np.maximum(way * size, 0.0).sum())
+                worth[key] += float(np.maximum(way * size, 0.0).sum())
     most = max(worth.values(), default=0.0)
-    names = sorted((key for key, x in worth.items() if x > SHARE * most), key=lambda k: -worth[k])
     words = []
-    for limit, joint in names[:NAMED]:
+    for (limit, joint), x in worth.most_common(NAMED):
+        if x <= SHARE * most:
+            break
         a = program.robot.actuators[joint]
         if limit.endswith("stop"):
             words.append(f"the {limit} of joint {joint!r}, {a[limit.split()[0]]:.3g} rad")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -17,12 +18,14 @@ from jumplab.stages.whole_body.coordinates import BASE, Coordinates, whole
 from jumplab.stages.whole_body.settings import Limits, Weights
 
 
+@dataclass(eq=False, repr=False)
 class Mode:
     """Numbers of one mode of contact.
 
     Attributes
     ----------
     feet : that carry, as of :class:`.ContactPhase`.
+    free : the coordinates that move, all if None.
     modes : side -> "flat" or "toe" of them; none in flight.
     coordinates : of a phase in this mode: the chart, then the pitch of each foot on its toes.
     states : force along each edge of each sole point's friction pyramid in the axes of the
@@ -36,29 +39,25 @@ class Mode:
     held, locked : that have to carry something, see :func:`held_joints`.
     """
 
-    def __init__(
-        self,
-        body: Body,
-        limits: Limits,
-        weights: Weights,
-        feet: str,
-        free: Coordinates | None = None,
-    ):
-        self.feet = feet
-        self.body = body
-        self.limits = limits
-        self.weights = weights
-        self.modes = modes_of(feet)
+    body: Body
+    limits: Limits
+    weights: Weights
+    feet: str
+    free: Coordinates | None = None
+
+    def __post_init__(self):
+        body = self.body
+        self.modes = modes_of(self.feet)
         self.robot = body.robot
         self.model = body.model
-        self.free = free = free or whole(body)
+        self.free = free = self.free or whole(body)
         self.flying = not self.modes
         self.nv = free.size
         self.sides = [side for side in self.modes if side in free.sides]
         self.raised = [side for side in self.sides if self.modes[side] == "toe"]
         pitches = (f"pitch of {SIDES[side]} foot" for side in self.raised)
         self.coordinates = (*free.free_names, *pitches)
-        self.edges = pyramid(limits.friction)[: 2 if free.plane else 4]
+        self.edges = pyramid(self.limits.friction)[: 2 if free.plane else 4]
         self.points = {side: self._sole_points(self.modes[side]) for side in self.sides}
         names = [
             f"force {k} of {SIDES[side]} foot"
@@ -93,11 +92,10 @@ class Mode:
         return [*moved, *(f"L_{'xyz'[k]}" for k in self.free.spins)]
 
     def _sole_points(self, mode: str) -> np.ndarray:
-        lim = self.limits
         half_width = self.robot.foot.half_width
         half_m = self.body.half_m
-        wide = half_width - min(lim.side_margin_m, 0.4 * half_width)
-        length = 2 * half_m - min(lim.cop_margin_m, 0.4 * half_m)
+        wide = half_width - min(self.limits.side_margin_m, 0.4 * half_width)
+        length = 2 * half_m - min(self.limits.cop_margin_m, 0.4 * half_m)
         back = (0.0, -length) if mode == "flat" else (0.0,)
         across = (0.0,) if self.free.plane else (wide, -wide)
         return np.array([[x, y, 0.0] for x in back for y in across])
@@ -128,11 +126,10 @@ class Mode:
 def held_joints(body: Body, free: Coordinates) -> tuple[list[int], list[LockedJoint]]:
     """Joints of the left half that are held in such a motion, as indices, and those of the
     published robot that never move; both have to carry something."""
-    model = body.model
     held = [
         k - 1
-        for k in (model.left_half if free.plane and not body.robot.planar else ())
-        if model.across[k] is None and k - 1 not in free.joints
+        for k in (body.model.left_half if free.plane and not body.robot.planar else ())
+        if body.model.across[k] is None and k - 1 not in free.joints
     ]
     return held, [x for x in body.robot.locked if not (free.even and _idle(x))]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.models.spatial import SpatialModel
-from jumplab.ocp.solution import PhaseGuess, PhaseSolution, quintic
+from jumplab.ocp.solution import PhaseGuess, PhaseSolution, quintic, resampled
 from jumplab.robot.contact import on_feet
 from jumplab.robot.legs import bring_feet, give_of
 from jumplab.stages.whole_body.body import Body
@@ -107,8 +107,8 @@ def along(schedule: Schedule, task: JumpTask, crouch: float = CROUCH, arms: floa
             carrying = list(p.modes)
             chart, left = reach(chart, goals, carrying)
             if left > REACHED:  # a leg that was drawn somewhere is no beginning
-                chart[BASE:] = body.stance[BASE:]
-                chart, left = reach(chart, goals, carrying)
+                stood = np.append(chart[:BASE], body.stance[BASE:])
+                chart, left = reach(stood, goals, carrying)
             missed = max(missed, left)
             rows.append(chart.copy())
         motion.charts.append(np.array(rows))
@@ -121,11 +121,8 @@ def still(schedule: Schedule, task: JumpTask) -> Motion:
     legs do not reach.
     """
     motion = along(schedule, task)
-    charts = []
-    for rows in motion.charts:
-        same = np.tile(schedule.body.stance, (len(rows), 1))
-        same[:, [0, SIDE, YAW]] = rows[:, [0, SIDE, YAW]]
-        charts.append(same)
+    carried = np.isin(range(len(schedule.body.stance)), [0, SIDE, YAW])
+    charts = [np.where(carried, rows, schedule.body.stance) for rows in motion.charts]
     return Motion(motion.durations, charts)
 
 
@@ -148,8 +145,7 @@ def mended(schedule: Schedule, task: JumpTask, motion: Motion) -> Motion:
     for k, rows in enumerate(motion.charts):
         legs = []
         for t, chart, other in zip(feet.times(k), rows, usual[k], strict=True):
-            goals = [feet.place(k, side, t) for side in (0, 1)]
-            moved, left = reach(chart, goals, [0, 1])
+            moved, left = reach(chart, [feet.place(k, side, t) for side in (0, 1)], [0, 1])
             legs.append(moved if left < OFF_M else other)
         charts.append(np.array(legs))
     return replace(motion, charts=charts)
@@ -206,18 +202,15 @@ def _curves(
     from scipy.ndimage import gaussian_filter1d  # slow to import
 
     body = schedule.body
-    phases = schedule.contacts.phases
     fine = np.linspace(0, starts[-1], SAMPLES)
     at, path = _path(schedule, task, starts)
-    x, y, yaw, up = (
-        gaussian_filter1d(np.interp(fine, at, column), SMOOTHING, mode="nearest")
-        for column in path.T
-    )
+    rounded = gaussian_filter1d(resampled(at, path, fine), SMOOTHING, axis=0, mode="nearest")
+    x, y, yaw, up = rounded.T
     height = body.stance[2] + up
     pitch = np.full_like(fine, body.stance[5])
     arms = np.zeros_like(fine)
     back, left, middle, landed = ARMS
-    for k, p in enumerate(phases):
+    for k, p in enumerate(schedule.contacts.phases):
         if not p.flying:
             continue
         begin, end = starts[k : k + 2]
@@ -375,8 +368,7 @@ def guess(schedule: Schedule, task: JumpTask, motion: Motion) -> dict[str, Phase
     """
     body = schedule.body
     holds = footholds(schedule, task)
-    starts = motion.starts
-    times = [np.linspace(*starts[k : k + 2], len(q)) for k, q in enumerate(motion.charts)]
+    times = [np.linspace(*motion.starts[k : k + 2], len(q)) for k, q in enumerate(motion.charts)]
     t, once = np.unique(np.concatenate(times).round(9), return_index=True)
     q = np.concatenate(motion.charts)[once]
     v = np.clip(np.gradient(q, t, axis=0), -RATE_BOX, RATE_BOX)
@@ -411,8 +403,8 @@ def _parabola(body: Body, ends: np.ndarray, duration: float) -> dict[str, float]
     data = tree.createData()
     first, last = (pin.centerOfMass(tree, data, q).copy() for q in configurations(body.model, ends))
     speed = (last - first) / duration + [0.0, 0.0, body.robot.gravity * duration / 2]
-    columns = {"com": first, "vel": speed, "L": np.zeros(3)}
-    return {f"{name}_{x}": y for name, v in columns.items() for x, y in zip("xyz", v, strict=True)}
+    names = [f"{name}_{x}" for name in ("com", "vel", "L") for x in "xyz"]
+    return dict(zip(names, [*first, *speed, 0.0, 0.0, 0.0], strict=True))
 
 
 def ramped(
@@ -433,8 +425,7 @@ def ramped(
         shapes = quintic([(0.0, 1.0), (0.0, 0.0), (0.0, 0.0)], length, since)
         motion = {key: getattr(x, key).copy() for key in "qva"}
         for columns, shape in zip(motion.values(), shapes, strict=True):
-            columns[:, SIDE] += task.side_m * shape
-            columns[:, YAW] += task.yaw_rad * shape
+            columns[:, [SIDE, YAW]] += np.outer(shape, [task.side_m, task.yaw_rad])
         constants = dict(x.constants)
         if "vel_y" in constants:
             constants["vel_y"] = task.side_m / x.duration

@@ -90,9 +90,8 @@ class WholeBodyPlan(Shown):
         """Manner of the jump, by fields of :class:`.Attempt`, in which plans of several starts
         differ.
         """
-        body = self.schedule.body
         q = self.tape.q[: self.tape.takeoff_index or None]
-        swings = [np.ptp(q[:, 1 + column]) for column, _ in body.shoulders]
+        swings = [np.ptp(q[:, 1 + column]) for column, _ in self.schedule.body.shoulders]
         heels = [x.q[-1, -1] for name, x in self.solution.phases.items() if name == "toe"]
         return {
             "cost": self.solution.statistics.objective,

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from operator import itemgetter
 
 import casadi as ca
 import numpy as np
@@ -152,10 +153,11 @@ class Schedule:
             launch = ca.vertcat(ends["flat"].end.duration, ends["toe"].end.duration)
             return launch - ends["flat"].end.p.launch_s
 
-        words = "track durations", "ours: fixed in the paper", "s", "problem"
-        joining = Term(*words, longer, self.weights.track_duration)
-        parameters |= {"momentum": 1, "launch_s": 2}
-        return Problem(NAME, phases, (joining,), parameters)
+        weight = self.weights.track_duration
+        joining = Term(
+            "track durations", "ours: fixed in the paper", "s", "problem", longer, weight
+        )
+        return Problem(NAME, phases, (joining,), {**parameters, "momentum": 1, "launch_s": 2})
 
     def _distance(self) -> Term:
         """The distance of the target, from the feet that leave last to those that land."""
@@ -229,8 +231,7 @@ class Schedule:
 
     def _phase(self, k: int) -> Phase:
         mode = self.modes[k]
-        phases = self.contacts.phases
-        given = phases[k]
+        given = self.contacts.phases[k]
         landed = self.landed(k)
         swinging = [side for side in self.free.sides if side not in mode.modes]
         references = {f"{SIDES[side]}_clearance": 1 for side in swinging}
@@ -284,7 +285,7 @@ class Schedule:
         _, side = self.contacts.landings[contact]
         first = self.body.places[side]
         p = (*self.contacts.first, *self.contacts.places)[contact]
-        middle = (first[0] + p.ahead_m, first[1] + p.left_m, first[2] + p.up_m, p.turn_rad)
+        middle = (*np.add(first, [p.ahead_m, p.left_m, p.up_m]), p.turn_rad)
         free = (*p.free_m, 0.0, p.free_rad)
         return [(x - y, x + y) for x, y in zip(middle, free, strict=True)]
 
@@ -302,9 +303,9 @@ class Schedule:
         most = np.inf if free.even else lim.knee_rad
         margin = lim.range_margin_rad
         if self._rebounds:
-            margin = np.maximum(
-                margin, np.minimum(lim.rebound_range_rad, self.body.stops_off_rad / 2)
-            )
+            stance = self.body.stance[BASE:]
+            off = np.minimum(stance - motors.lower, motors.upper - stance)  # the nearer stop
+            margin = np.maximum(margin, np.minimum(lim.rebound_range_rad, off / 2))
         low, high = self.body.ranges(margin, least, most)
         low, high = free.within(np.concatenate([-wide, low]), np.concatenate([wide, high]))
         low = np.concatenate([low, none])
@@ -348,8 +349,9 @@ class Schedule:
         out = []
         if k == 0:
             words = "stance", "ours: the paper prints no start", "rad", "q"
+            stance = itemgetter("stance")  # of the parameters
             out = [
-                Bound(*words, _stance, _stance, "start"),
+                Bound(*words, stance, stance, "start"),
                 Bound("at rest", "ours", "rad/s", "v", 0.0, 0.0, "start"),
                 Bound("at rest (acceleration)", "ours", "rad/s^2", "a", 0.0, 0.0, "start"),
             ]
@@ -373,10 +375,6 @@ class Schedule:
             gone += range(first + kept, first + count)
             first += count
         return gone
-
-
-def _stance(parameters):
-    return parameters["stance"]
 
 
 def _landing_height(level: float, parameters: Mapping) -> float:

@@ -155,8 +155,7 @@ class Program(Shown):
     def like(self, robot: Robot) -> Program:
         """The same for another robot with the same joints."""
         body = Body(robot)
-        free = KINDS[self.free.kind](body)
-        return replace(self, body=body, free=free, keep=False)
+        return replace(self, body=body, free=KINDS[self.free.kind](body), keep=False)
 
     @property
     def size(self) -> int:
@@ -388,9 +387,9 @@ def _given(schedule: Schedule, motion: Motion, k: int) -> dict[str, np.ndarray]:
     (size, N + 1).
     """
     count = schedule.contacts.phases[k].intervals + 1
-    shares = [np.linspace(0, 1, n) for n in (len(motion.charts[k]), count)]
+    old, new = (np.linspace(0, 1, n) for n in (len(motion.charts[k]), count))
     values = {
-        "chart": resampled(shares[0], motion.charts[k], shares[1]).T,
+        "chart": resampled(old, motion.charts[k], new).T,
         "lasts": np.full((1, count), motion.durations[k]),
     }
     for side in schedule.landed(k):
@@ -409,6 +408,6 @@ def _followed(srmp: SrmpPlan, name: str, intervals: int) -> dict[str, np.ndarray
     part = srmp.flight if name == "flight" else srmp.launch
     t = np.linspace(*spans[name], intervals + 1)
     return {
-        key: np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column).T)])
+        key: resampled(part.t, getattr(part, column).reshape(len(part.t), -1), t).T
         for key, column in columns.items()
     }

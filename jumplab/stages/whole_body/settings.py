@@ -204,14 +204,9 @@ class Weights:
 # the audit's 1 mm, and 1 mm by which links may be nearer than their row before it is met
 LINKS_LEAST_M = 0.002
 # of the numbers that grow with the robot
-LIMIT_UNITS = dict.fromkeys(
-    (
-        *("cop_margin_m", "clearance_m", "body_clearance_m", "shank_clearance_m"),
-        *("ankle_margin_m", "capture_offset_m", "capture_window_m", "side_margin_m"),
-        *("torsion_arm_m", "hands_inward_m", "link_distance_m"),
-    ),
-    "m",
-)
+LIMIT_UNITS = {
+    name: "m" for name in vars(Limits()) if name.endswith("_m") and not name.startswith("edge_")
+}
 LIMIT_UNITS |= dict.fromkeys(("flat_s", "toe_s", "capture_slope_s"), "s")
 LIMIT_UNITS |= {
     name: "rad/s" for name in vars(Limits()) if name.startswith("touchdown_") and "_rate" in name

@@ -54,8 +54,7 @@ class Pair:
         a = self.first
         b = self.second
         axis = self.face // 2
-        out = a.axes[:, axis] * (1 if self.face % 2 else -1)
-        way = s.rotation(a.body) @ ca.DM(out)
+        way = s.rotation(a.body) @ ca.DM(a.axes[:, axis] * (1 if self.face % 2 else -1))
         middle = s.point(b.body, b.centre) - s.point(a.body, a.centre)
         return ca.dot(way, middle) - float(a.half[axis]) - b.reach(s, way)
 

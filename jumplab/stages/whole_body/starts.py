@@ -134,16 +134,15 @@ class Start:
         return self.options.get("acceptable_constr_viol_tol", 0.0) > RESIDUAL_LIMIT
 
 
-def from_schedule(program: Program, asked: Asked, **drawn: float) -> Beginning:
-    """A motion ``drawn`` along the schedule (see :func:`.along`)."""
+def from_schedule(
+    program: Program, asked: Asked, draw: Callable[..., Motion] = reached, **drawn: Any
+) -> Beginning:
+    """A motion along the schedule, as a function such as :func:`.reached` ``draw``s it."""
     schedule = program.schedule()
-    return Beginning(guess(schedule, asked.task, reached(schedule, asked.task, **drawn)))
+    return Beginning(guess(schedule, asked.task, draw(schedule, asked.task, **drawn)))
 
 
-def from_stance(program: Program, asked: Asked) -> Beginning:
-    """The stance, carried along the schedule (see :func:`.still`)."""
-    schedule = program.schedule()
-    return Beginning(guess(schedule, asked.task, still(schedule, asked.task)))
+from_stance = partial(from_schedule, draw=still)  # the stance, carried along
 
 
 def from_motion(program: Program, asked: Asked) -> Beginning:
@@ -153,8 +152,7 @@ def from_motion(program: Program, asked: Asked) -> Beginning:
 
 def from_mended(program: Program, asked: Asked) -> Beginning:
     """The same with its feet in their places (see :func:`.mended`)."""
-    schedule = program.schedule()
-    return Beginning(guess(schedule, asked.task, mended(schedule, asked.task, asked.motion)))
+    return from_schedule(program, asked, mended, motion=asked.motion)
 
 
 def from_neighbour(program: Program, asked: Asked) -> Beginning:
@@ -192,8 +190,7 @@ def from_solved(program: Program, solved: Solved) -> Beginning:
         ratio = count / solved.schedule.contacts.phases[x.phase].intervals
         last = min(count, math.ceil(ratio * x.last))
         apart.append(replace(x, first=max(1, int(ratio * x.first)), last=last))
-    solution = solved.solution
-    return Beginning(solution.guess(intervals), solution.multipliers, tuple(apart))
+    return Beginning(solved.solution.guess(intervals), solved.solution.multipliers, tuple(apart))
 
 
 def unpassed(program: Program, asked: Asked, rows: Sequence[Apart]) -> Beginning:

@@ -74,11 +74,10 @@ def make_tape(schedule: Schedule, phases: Mapping[str, PhaseSolution], gravity: 
             pieces.append(_flight(body, solved[first], before, t, sides, robot))
         else:
             pieces.append(_ground(schedule, solved, numbers, before, t, starts, robot))
-    t = np.concatenate([p.t for p in pieces])
-    motion = np.concatenate([p.motion for p in pieces], axis=1)
-    q, v, a = body.model.to_pinocchio(*motion)
-    wrench = np.concatenate([p.wrench for p in pieces])
-    contacts = np.concatenate([p.contacts for p in pieces])
+    t, wrench, contacts = (
+        np.concatenate([getattr(p, name) for p in pieces]) for name in ("t", "wrench", "contacts")
+    )
+    q, v, a = body.model.to_pinocchio(*np.concatenate([p.motion for p in pieces], axis=1))
     feet = feet_of(robot, q)
     f, tau, extra = forces(robot, q, v, a, wrench, contacts, feet)
     toes = np.flatnonzero((contacts == TOE).any(axis=1))
@@ -198,8 +197,7 @@ def _ground(
         if k == numbers[-1] and k + 1 < len(solved) and not leaves:
             end = legs.held(motion[:, -1:], holds, b.raised)
             more = _arriving_legs(schedule, solved, k + 1, end)
-            size = end.shape[-1]
-            motion[..., :size] += quintic(more, phase.duration, at[:, None])
+            motion[..., : end.shape[-1]] += quintic(more, phase.duration, at[:, None])
         line = _on_a_line(holds, b.raised) and not (schedule.follows and len(holds) == 1)
         if len(instants) > 1 and (line or leaves or schedule.follows):
             count = 1 if line else max(1, round((instants[-1] - instants[0]) / BALANCED_S))
@@ -281,19 +279,18 @@ def _balanced(
     every = np.arange(len(t))
     ways = np.array([[*ahead, 0.0, 0.0, 0.0]]) if line else np.eye(BASE)
     seen = np.array([[0.0, 0.0, 0.0, *across]]) if line else np.eye(BASE)
-    model = robot.model
-    data = model.createData()
+    data = robot.model.createData()
 
-    def missing(change: np.ndarray | float = 0.0, rows: np.ndarray = every) -> np.ndarray:
+    def missing(change=0.0, rows=every):
         moved = motion[:, rows]
         moved[2, :, :BASE] += change
         held = legs.held(moved, holds, raised)
         states = zip(*legs.body.model.to_pinocchio(*held), strict=True)
-        need = [needed(x[0], pin.rnea(model, data, *x)) for x in states]
+        need = [needed(x[0], pin.rnea(robot.model, data, *x)) for x in states]
         force, about = np.split(np.array(need) - wrench[rows], 2, axis=1)
         return np.hstack([force, about - np.cross(edge[:3], force)]) @ seen.T
 
-    def integrated(more: np.ndarray) -> np.ndarray:
+    def integrated(more):
         rate = cumulative_trapezoid(more, t, axis=0, initial=0.0)
         return np.array([cumulative_trapezoid(rate, t, axis=0, initial=0.0), rate, more])
 
@@ -344,16 +341,16 @@ def _flight(
     last = before.motion[:, -1:]
     more = _joining(last[:, 0, BASE:], planned[:, 0, BASE:], since, since[-1])
     joints = planned[..., BASE:] + more
-    fall = Fall(robot, model, last)
+    fall = falling(robot, model, last)
     missed = _arriving(body, planned[:, -1:], sides)
     none = np.zeros(model.joints)
     near = planned[0][:, 3:BASE]
 
-    def fallen(change: np.ndarray, rows: slice = slice(None)) -> tuple[np.ndarray, ...]:
+    def fallen(change, rows=slice(None)):
         """The motion if joints and their rates end with a change (2 joints,)."""
         shift, rate = np.split(change, 2)
         bends = quintic([(none, shift), (none, rate), (none, none)], since[-1], since[:, None])
-        return fall.motion(joints + bends, since, near, rows)
+        return fall(joints + bends, since, near, rows)
 
     # the change moves the base as well, in a jump by little, in a flip by about as much
     options = dict(alpha=1.0, f_tol=LANDED_RAD, maxiter=LANDINGS, line_search=None)
@@ -363,8 +360,7 @@ def _flight(
     except NoConvergence as e:
         change = e.args[0]
     chart = model.charts(*fallen(change), near=near[0])
-    codes = np.full((len(t), 2), AIR, np.int8)
-    return Piece(t, chart, np.zeros((len(t), 2, 6)), codes)
+    return Piece(t, chart, np.zeros((len(t), 2, 6)), np.full((len(t), 2), AIR, np.int8))
 
 
 def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[..., np.ndarray]:
@@ -378,7 +374,7 @@ def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[...
     anchors = on_feet(body.robot, np.zeros(3))
     feet = [anchors[side] for side in sides]
 
-    def slopes(q: np.ndarray) -> np.ndarray:
+    def slopes(q):
         """(6 k, nv) of the feet's twists, in their axes."""
         pin.computeJointJacobians(tree, data, q)
         return np.vstack([foot.slope(tree, data, LOCAL) for foot in feet])
@@ -387,7 +383,7 @@ def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[...
     speeds = slopes(q) @ v
     goals = {foot: foot.place(data) for foot in feet}
 
-    def missed(q: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+    def missed(q, v, _):
         there, _ = bring_feet(tree, data, q[0], goals, give)
         rows = slopes(there)
         rates = least_motion(rows, speeds - rows @ v[0], give)
@@ -396,86 +392,81 @@ def _arriving(body: Body, end: np.ndarray, sides: Sequence[int]) -> Callable[...
     return missed
 
 
-class Fall:
-    """A free fall from an ``end`` (3, 1, nv) of a motion: what the base does while the joints of a
-    ``robot``, whose model feels gravity, move.
+def falling(robot: Robot, model: SpatialModel, end: np.ndarray) -> Callable[..., tuple]:
+    """Free fall of a ``robot``, whose model feels gravity, from an ``end`` (3, 1, nv) of a motion,
+    by what its joints do then.
 
-    Attributes
-    ----------
-    com, velocity : (3,) of the CoM at its beginning [m, m/s].  spin : L (3,) about it [kg m^2/s].
-    angles : (3,) yaw, roll and pitch of the base at its beginning [rad].
+    The function takes angles, rates and accelerations of the joints (3, n, joints), their times t
+    (n,) [s], angles (n, 3) near those of the base, and which rows (m,) are asked for; it returns
+    configurations (m, nq), twists and accelerations (m, nv).
     """
+    tree = robot.model
+    data = tree.createData()
+    q, v, _ = (x[0] for x in model.to_pinocchio(*end))
+    momentum = pin.computeCentroidalMomentum(tree, data, q, v)
+    com = data.com[0].copy()
+    speed = momentum.linear / model.mass
+    spin = momentum.angular.copy()
+    down = tree.gravity.linear
 
-    def __init__(self, robot: Robot, model: SpatialModel, end: np.ndarray):
-        self.robot = robot
-        self.model = model
-        q, v, _ = (x[0] for x in model.to_pinocchio(*end))
-        data = robot.model.createData()
-        momentum = pin.computeCentroidalMomentum(robot.model, data, q, v)
-        self.com = data.com[0].copy()
-        self.velocity = momentum.linear / model.mass
-        self.spin = momentum.angular.copy()
-        self.angles = end[0, 0, 3:BASE]
-
-    def motion(
-        self, joints: np.ndarray, t: np.ndarray, near: np.ndarray, rows: slice = slice(None)
-    ) -> tuple[np.ndarray, ...]:
-        """Configurations (m, nq), twists and accelerations (m, nv) at some ``rows`` of times ``t``
-        (n,) [s], from the angles, rates and accelerations of the ``joints`` (3, n, joints); the
-        base's angles are sought at ``near`` (n, 3).
-        """
-        tree = self.robot.model
-        data = tree.createData()
+    def motion(joints, t, near, rows=slice(None)):
         zero = np.zeros((len(t), 3))
-        base = [*self._turned(*self._spins(joints), t, near), zero]
-        motion = [np.hstack([zero, *x])[rows] for x in zip(base, joints, strict=True)]
-        q, v, a = self.model.to_pinocchio(*motion)
-        down = tree.gravity.linear
+        turned = _turned(model, joints, spin, end[0, 0, 3:BASE], t, near)
+        levels = zip((*turned, zero), joints, strict=True)
+        q, v, a = model.to_pinocchio(*(np.hstack([zero, *x])[rows] for x in levels))
         for k, since in enumerate(t[rows]):
             pin.centerOfMass(tree, data, q[k], v[k])
-            speed = self.velocity + down * since - data.vcom[0]
-            q[k, :3] = self.com + self.velocity * since + down * since**2 / 2 - data.com[0]
-            v[k, :3] = data.oMi[1].rotation.T @ speed
+            q[k, :3] = com + speed * since + down * since**2 / 2 - data.com[0]
+            v[k, :3] = data.oMi[1].rotation.T @ (speed + down * since - data.vcom[0])
             a[k, :BASE] = 0.0
             missing = pin.rnea(tree, data, q[k], v[k], a[k])[:BASE]
             a[k, :BASE] = -np.linalg.solve(pin.crba(tree, data, q[k])[:BASE, :BASE], missing)
         return q, v, a
 
-    def _spins(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angular velocity of the base per L (n, 3, 3), and L that the joints carry (n, 3), in the
-        base's axes.
-        """
-        tree = self.model.model
-        data = tree.createData()
-        n = len(joints[0])
-        q = np.hstack([np.tile(pin.neutral(tree)[:7], (n, 1)), joints[0]])
-        v = np.hstack([np.zeros((n, BASE)), joints[1]])
-        inertia = np.empty((n, 3, 3))
-        carried = np.empty((n, 3))
-        for k in range(n):
-            pin.ccrba(tree, data, q[k], v[k])
-            inertia[k] = data.Ag[3:, 3:6]
-            carried[k] = data.hg.angular
-        return np.linalg.inv(inertia), carried
+    return motion
 
-    def _turned(
-        self, yielding: np.ndarray, carried: np.ndarray, t: np.ndarray, near: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Angles of the base and their rates (n, 3), of which L stays, from what :meth:`_spins`
-        says; by Picard's iteration, as a whole, which takes more rounds the more the base turns.
-        """
-        from scipy.integrate import cumulative_simpson  # slow to import
 
-        angles = near
-        for _ in range(TURNS):
-            turn, slope = self.model.attitudes(angles)
-            spin = np.matvec(yielding, self.spin @ turn - carried)
-            rates = np.linalg.solve(slope, spin[..., None])[..., 0]
-            before = angles
-            angles = self.angles + cumulative_simpson(rates, x=t, axis=0, initial=0.0)
-            if np.abs(angles - before).max() < TURNED_RAD:
-                break
-        return angles, rates
+def _turned(
+    model: SpatialModel,
+    joints: np.ndarray,
+    spin: np.ndarray,
+    first: np.ndarray,
+    t: np.ndarray,
+    near: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Angles of the base and their rates (n, 3) at times ``t`` (n,) [s], with which L stays the
+    ``spin`` (3,) while the ``joints`` (3, n, joints) move, from the ``first`` angles (3,) on; by
+    Picard's iteration from angles ``near`` (n, 3), as a whole, which takes more rounds the more the
+    base turns.
+    """
+    from scipy.integrate import cumulative_simpson  # slow to import
+
+    yielding, carried = _spins(model.model, joints)
+    angles = near
+    for _ in range(TURNS):
+        turn, slope = model.attitudes(angles)
+        turning = np.matvec(yielding, spin @ turn - carried)
+        rates = np.linalg.solve(slope, turning[..., None])[..., 0]
+        before = angles
+        angles = first + cumulative_simpson(rates, x=t, axis=0, initial=0.0)
+        if np.abs(angles - before).max() < TURNED_RAD:
+            break
+    return angles, rates
+
+
+def _spins(tree: pin.Model, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angular velocity of the base per L (n, 3, 3), and L that the ``joints`` (3, n, joints) carry
+    (n, 3), in the base's axes.
+    """
+    data = tree.createData()
+    inertia = np.empty((len(joints[0]), 3, 3))
+    carried = np.empty((len(joints[0]), 3))
+    base = pin.neutral(tree)[:7]
+    for k, (angles, rates, _) in enumerate(zip(*joints, strict=True)):
+        pin.ccrba(tree, data, np.append(base, angles), np.append(np.zeros(BASE), rates))
+        inertia[k] = data.Ag[3:, 3:6]
+        carried[k] = data.hg.angular
+    return np.linalg.inv(inertia), carried
 
 
 # forces
@@ -519,13 +510,12 @@ def forces(
     total[s] = wrench[s] + _shared(wrench[s], soles, contacts[s], missing, least)
     torques[s] -= np.einsum("nkij,nki->nj", slopes, total[s])
     total[..., 3:] -= np.cross(origin, total[..., :3])
-    tau = torques[:, 6:] + robot.limits.lost(v[:, 6:])
     extra = {
         "com": com,
         "com_velocity": momentum[:, :3] / robot.total_mass,
         "angular_momentum": momentum[:, 3:],
     }
-    return total, tau, extra
+    return total, torques[:, 6:] + robot.limits.lost(v[:, 6:]), extra
 
 
 def _shared(

@@ -57,20 +57,25 @@ def smoothness(m: Mode, follows: bool = False) -> list[Term]:
     from the stance, or from the motion that it ``follows``.
     """
     w = m.weights
-    origin = "WL-J2, WF-J2"
 
     def bent(p):
         near = p.ref.chart if follows else ca.DM(m.body.stance)
         return (p.tree.q - near)[m.body.upper]
 
     def uneven(p):
-        pairs = mirror(m.robot.model)
-        rows = [p.q[BASE + k] - sign * p.q[BASE + i] for i, k, sign in pairs]
+        rows = [p.q[BASE + k] - sign * p.q[BASE + i] for i, k, sign in mirror(m.robot.model)]
         return p.p.straight * ca.vertcat(p.q[3:5], *rows)
 
     terms = [
-        Term("acceleration", origin, "rad/s^2", "node", lambda p: m.moving(p.a), w.acceleration),
-        Term("jerk", origin, "rad/s^3", "mid", lambda p: m.moving(p.j), w.jerk),
+        Term(
+            "acceleration",
+            "WL-J2, WF-J2",
+            "rad/s^2",
+            "node",
+            lambda p: m.moving(p.a),
+            w.acceleration,
+        ),
+        Term("jerk", "WL-J2, WF-J2", "rad/s^3", "mid", lambda p: m.moving(p.j), w.jerk),
         Term("torque", "ours: effort", "N m", "node", "joint_torques", w.torque),
     ]
     if not m.flying:
@@ -118,8 +123,9 @@ def dynamics(m: Mode, skip: tuple[int, int]) -> list[Term]:
     if len(effort):
         locked = [m.limits.torque_share * x.effort for x in m.locked]
         most = np.array([*m.usable_torques[m.held], *locked]) / effort
-        words = HOLDING, "ours: limit", "of the effort", "node"
-        rows.append(limit(*words, holding, -most, most, **shared))
+        rows.append(
+            limit(HOLDING, "ours: limit", "of the effort", "node", holding, -most, most, **shared)
+        )
     return rows
 
 
@@ -132,8 +138,9 @@ def motor_lines(m: Mode, skip: tuple[int, int]) -> Term:
     def line(p):
         return (p.motor_torques + ca.DM(slope) * p.rates) / ca.DM(motors.effort)
 
-    words = TORQUE_SPEED, "ours: motor line", "of the effort", "node"
-    return limit(*words, line, -most, most, skip=skip)
+    return limit(
+        TORQUE_SPEED, "ours: motor line", "of the effort", "node", line, -most, most, skip=skip
+    )
 
 
 def bus_power(m: Mode, skip: tuple[int, int]) -> list[Term]:
@@ -150,8 +157,9 @@ def bus_power(m: Mode, skip: tuple[int, int]) -> list[Term]:
         rubbed = ca.DM(m.body.motors.friction) * ca.tanh(rates / SLIDING_RATE)
         return ca.sum1(bus.drawn(p.joint_torques + rubbed, rates, ca, SMOOTH_W * most))
 
-    words = "bus power", "ours: limit", "W", "node"
-    return [limit(*words, drawn, -np.inf, most, scale=most, skip=skip)]
+    return [
+        limit("bus power", "ours: limit", "W", "node", drawn, -np.inf, most, scale=most, skip=skip)
+    ]
 
 
 def body_clearance(m: Mode) -> Term:
@@ -167,27 +175,22 @@ def body_clearance(m: Mode) -> Term:
     shanks = [spot for spot in body.shank_points if spot[0] in counted]
     face = body.shank_m + lim.shank_clearance_m
 
-    def beside(p, x, step, drop):
-        """Height that a shank needs beyond an edge up, and about an edge down: behind it, the
-        feet keep it up.
-        """
-        near = p.over_edge(x, face)
-        return step * near + drop * (near - p.over_edge(x, -face))
-
     def heights(p):
-        lowest = ca.fmin(p.p.platform, 0)
-        step = (p.p.platform > 0) * (p.p.platform + face)
-        drop = (p.p.platform < 0) * (face - p.p.platform)
+        top = p.p.platform
+        step = (top > 0) * (top + face)
+        drop = (top < 0) * (face - top)
         points = [p.tree.point(*spot) for spot, _ in limbs]
-        faces = [p.tree.point(*spot) for spot in shanks]
-        return ca.vertcat(
-            *(x[2] - p.ground(x, lim.edge_clearance_m) for x in points),
-            *(x[2] - lowest - beside(p, x, step, drop) for x in faces),
-        )
+        rows = [x[2] - p.ground(x, lim.edge_clearance_m) for x in points]
+        for spot in shanks:
+            x = p.tree.point(*spot)
+            near = p.over_edge(x, face)
+            # beyond an edge up, and about an edge down: behind that, the feet keep it up
+            beside = step * near + drop * (near - p.over_edge(x, -face))
+            rows.append(x[2] - ca.fmin(top, 0) - beside)
+        return ca.vertcat(*rows)
 
     least = np.array([least for _, least in limbs] + [0.0] * len(shanks))
-    words = "body clearance", "ours", "m", "node"
-    return limit(*words, heights, least, skip=(1, 0), **CLEAR)
+    return limit("body clearance", "ours", "m", "node", heights, least, skip=(1, 0), **CLEAR)
 
 
 def over_block(m: Mode, over: tuple[float, float, float], beside_m: float) -> Term:
@@ -199,8 +202,7 @@ def over_block(m: Mode, over: tuple[float, float, float], beside_m: float) -> Te
     lim = m.limits
     first, last, top = over
     middle = float(body.places[:, 0].mean()) + (first + last) / 2
-    smooth = lim.edge_smoothing_m
-    beyond = max(min(lim.edge_step_m / 2, ROOF_HIGH * beside_m), smooth)
+    beyond = max(min(lim.edge_step_m / 2, ROOF_HIGH * beside_m), lim.edge_smoothing_m)
     half = (last - first) / 2 + beyond  # of the part that is at least as high as the block
     slope = max(ROOF_ENDS * beside_m - beyond, 2 * half)  # steeper, its ridge is out of reach
     face = body.shank_m + lim.clearance_m
@@ -212,7 +214,7 @@ def over_block(m: Mode, over: tuple[float, float, float], beside_m: float) -> Te
         spots += [((body.feet[side], x), lim.clearance_m) for x in np.concatenate(sole)]
 
     def roof(x):
-        share = 1 - (ca.sqrt((x - middle) ** 2 + smooth**2) - half) / slope
+        share = 1 - (ca.sqrt((x - middle) ** 2 + lim.edge_smoothing_m**2) - half) / slope
         return (share + ca.sqrt(share**2 + ROOF_ROUND**2)) / 2
 
     def heights(p):
@@ -257,8 +259,7 @@ def sides_apart(m: Mode) -> list[Term]:
     def rows(p):
         return ca.DM(way) * across(p.tree)
 
-    words = "sides apart", "ours", "m", "node"
-    return [limit(*words, rows, least, skip=(1, 0), **CLEAR)]
+    return [limit("sides apart", "ours", "m", "node", rows, least, skip=(1, 0), **CLEAR)]
 
 
 def link_distance(m: Mode, kept: Apart, intervals: int) -> Term:
@@ -280,8 +281,11 @@ def largest(name: str) -> Term:
     """A parameter of the target that is an unknown is as large as can be: as close as can be to
     :data:`FAR`, which no target reaches. Effort counts little beside it.
     """
-    of = "ours: what is largest", "m, m/s, rad", "end"
-    return Term(RECORD, *of, lambda p: FAR - getattr(p.p, name), WORTH / (2 * FAR))
+
+    def missing(p):
+        return FAR - getattr(p.p, name)
+
+    return Term(RECORD, "ours: what is largest", "m, m/s, rad", "end", missing, WORTH / (2 * FAR))
 
 
 def gentle_heels(m: Mode) -> Term:
@@ -376,11 +380,11 @@ def torsion(m: Mode, side: int) -> Term:
     def left(p):
         force, moment = (x / m.body.mg for x in p.pressed(side))
         twist = ca.dot(force, moment)  # that moment times the load
-        return ca.vertcat(arm * force[2] ** 2 - twist, arm * force[2] ** 2 + twist)
+        most = arm * force[2] ** 2
+        return ca.vertcat(most - twist, most + twist)
 
     words = f"spin of {SIDES[side]} foot", "ours: friction", "m, of the squared weight", "node"
-    options = {"scale": MOMENT_ARM_M / 10, "group": "torsion"}
-    return limit(*words, left, -TORSION_SLACK_M, **options)
+    return limit(*words, left, -TORSION_SLACK_M, scale=MOMENT_ARM_M / 10, group="torsion")
 
 
 def reserve(m: Mode) -> list[Term]:
@@ -395,14 +399,12 @@ def reserve(m: Mode) -> list[Term]:
         rows = []
         for side in m.sides:
             force, moment = (x / m.body.mg for x in p.pressed(side))
-            load = force[2]
             behind = moment[1]  # of the toe
             length = -m.points[side][-1, 0]
-            rows += [behind - kept * load, (length - kept) * load - behind]
+            rows += [behind - kept * force[2], (length - kept) * force[2] - behind]
         return ca.vertcat(*rows)
 
-    words = "CoP reserve", "ours", "m, of the weight", "node"
-    return [limit(*words, left, scale=PLACE_SCALE)]
+    return [limit("CoP reserve", "ours", "m, of the weight", "node", left, scale=PLACE_SCALE)]
 
 
 # feet in the air
@@ -429,8 +431,9 @@ def swing_rows(m: Mode, side: int, follows: bool) -> Term:
         points = [p.tree.point(foot, place) for place in (*places, np.zeros(3))]
         return ca.vertcat(*(x[2] - p.ground(x) - low for x, low in zip(points, lows, strict=True)))
 
-    words = f"clearance of {SIDES[side]} sole", "ours", "m", "node"
-    return limit(*words, heights, skip=(1, 1), **CLEAR)
+    return limit(
+        f"clearance of {SIDES[side]} sole", "ours", "m", "node", heights, skip=(1, 1), **CLEAR
+    )
 
 
 def flight_rows(m: Mode) -> list[Term]:
@@ -518,19 +521,19 @@ def touchdown_rows(m: Mode) -> list[Term]:
     """Touchdown: :func:`touchdown_feet`, posture, rates, and the soles against the CoM."""
     lim = m.limits
     free = m.free
-    body = m.body
     angles = [free.free[k] - 3 for k in free.turns]
     # hips that hardly bend let a robot squat less than a landing should have
-    bent = min(lim.touchdown_knee[0], body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
+    bent = min(lim.touchdown_knee[0], m.body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
     trunk = rates_within(m, lim.touchdown_trunk_rate, np.eye(3)[0][angles])
     rate = lim.touchdown_joint_rate
-    turning = "trunk rates at touchdown", "ours", "rad/s", "end"
     return [
         rise(),
         *touchdown_feet(m),
         *landing_posture(m, bent),
         limit("joint rates at touchdown", "WF-E1, relaxed", "rad/s", "end", "rates", -rate, rate),
-        limit(*turning, lambda p: p.v[free.turns], *trunk),
+        limit(
+            "trunk rates at touchdown", "ours", "rad/s", "end", lambda p: p.v[free.turns], *trunk
+        ),
         *upright_waist(m),
         *ankle_stroke(m, lim.touchdown_ankle_stroke if free.plane else None),
         *capture_rows(m),
@@ -543,8 +546,7 @@ def rebound_rows(m: Mode) -> list[Term]:
     """
     lim = m.limits
     bent = lim.straight_knee_rad, lim.touchdown_knee[1]
-    stroke = ankle_stroke(m, lim.rebound_ankle_rad)
-    return [*landing_posture(m, bent), *stroke, *capture_rows(m)]
+    return [*landing_posture(m, bent), *ankle_stroke(m, lim.rebound_ankle_rad), *capture_rows(m)]
 
 
 def landing_posture(m: Mode, bent: tuple[float, float]) -> list[Term]:
@@ -552,8 +554,8 @@ def landing_posture(m: Mode, bent: tuple[float, float]) -> list[Term]:
     lim = m.limits
     free = m.free
     angles = [free.free[k] - 3 for k in free.turns]
-    low = np.array([-lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]])[angles]
-    high = np.array([lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]])[angles]
+    yaw, roll = lim.touchdown_yaw, lim.touchdown_roll
+    low, high = np.array([(-yaw, yaw), (-roll, roll), lim.touchdown_pitch])[angles].T
 
     def attitude(p):
         return (p.attitude - ca.vertcat(p.p.yaw, 0, p.p.rotation))[angles]
@@ -575,8 +577,11 @@ def upright_waist(m: Mode) -> list[Term]:
         return []
     most = m.limits.touchdown_waist_rad
     stance = ca.DM(m.body.stance[columns])
-    words = "waist at touchdown", "ours: stroke", "rad", "end"
-    return [limit(*words, lambda p: p.tree.q[columns] - stance, -most, most)]
+
+    def bent(p):
+        return p.tree.q[columns] - stance
+
+    return [limit("waist at touchdown", "ours: stroke", "rad", "end", bent, -most, most)]
 
 
 def rates_within(m: Mode, rates: float, vertical: Sequence[float]) -> tuple[Callable, Callable]:
@@ -593,7 +598,6 @@ def rates_within(m: Mode, rates: float, vertical: Sequence[float]) -> tuple[Call
 
 def touchdown_feet(m: Mode) -> list[Term]:
     """Both feet in their new places, flat, without spin or slip."""
-    lim = m.limits
     free = m.free
     body = m.body
     turning = [1] if free.plane else [0, 1, 2]
@@ -618,11 +622,11 @@ def touchdown_feet(m: Mode) -> list[Term]:
         rows = []
         for side in free.sides:
             speed = p.tree.point_velocity(body.feet[side], body.middles[side])
-            rows.append(np.sign(m.edges[:, :2]) @ speed[:2] - lim.touchdown_slope * speed[2])
+            rows.append(np.sign(m.edges[:, :2]) @ speed[:2] - m.limits.touchdown_slope * speed[2])
         return ca.vertcat(*rows)
 
     vertical = np.eye(3)[2][turning].tolist() * len(free.sides)
-    spin = rates_within(m, lim.touchdown_foot_rate, vertical)
+    spin = rates_within(m, m.limits.touchdown_foot_rate, vertical)
     sticks = "soles that stick at touchdown", "ours: friction", "m/s", "end"
     return [
         Term("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", "end", goal),
@@ -654,9 +658,8 @@ def capture_rows(m: Mode) -> list[Term]:
         caught = p.sole_middle - p.com - ahead - lim.capture_slope_s * p.flight("vel")
         return caught[[k for k in m.free.places if k < 2]]
 
-    window = lim.capture_window_m
     words = "capture window", f"ours; {CAPTURE}", "m", "end"
-    return [limit(*words, capture, -window, window, scale=PLACE_SCALE)]
+    return [limit(*words, capture, -lim.capture_window_m, lim.capture_window_m, scale=PLACE_SCALE)]
 
 
 def about(m: Mode, p: Instant, place: ca.SX) -> ca.SX:

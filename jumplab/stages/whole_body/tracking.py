@@ -22,7 +22,6 @@ def tracking(m: Mode) -> list[Term]:
     Heel up, the heel stays quiet besides, and L at take-off is stage 1's (WL-D1).
     """
     w = m.weights
-    lim = m.limits
     origin = "WF-J1" if m.flying else "WL-J1"
     # [kg m^2] of the stance
     size = m.model.mass * rod_of(m.robot, stance_angles(m.robot))[3] ** 2
@@ -43,8 +42,11 @@ def tracking(m: Mode) -> list[Term]:
     def momentum(p):
         return p.L[1] - p.ref.L
 
+    def heel(p):
+        return p.point_velocity("left_heel")[2]
+
     def momentum_kept(p):
-        slack = ca.fmax(lim.momentum_share * ca.fabs(p.p.momentum), lim.momentum_slack)
+        slack = ca.fmax(m.limits.momentum_share * ca.fabs(p.p.momentum), m.limits.momentum_slack)
         difference = p.L[1] - p.p.momentum
         return ca.vertcat(slack - difference, slack + difference)
 
@@ -53,18 +55,20 @@ def tracking(m: Mode) -> list[Term]:
         follow("track inertia rate", origin, "kg m^2/s", inertia_rate, rates / size**2),
     ]
     if m.flying:
-        ankle = "ankle rate", "WF-J2", "rad/s", lambda p: p.joint_rates.ankle[0]
-        return [*rows, follow(*ankle, w.ankle_rate)]
+        ankle = follow(
+            "ankle rate", "WF-J2", "rad/s", lambda p: p.joint_rates.ankle[0], w.ankle_rate
+        )
+        return [*rows, ankle]
     spin = "WL-D1, as a cost on L"
     rows += [
         follow("track velocity", origin, "m/s", velocity, w.track_velocity),
         follow("track momentum", spin, "kg m^2/s", momentum, w.track_momentum / size**2),
     ]
     if m.raised:
-        words = "L at take-off", "WL-D1", "kg m^2/s", "end"
-        heel = "m/s", lambda p: p.point_velocity("left_heel")[2]
-        rows.append(follow("heel velocity", "WL-J3", *heel, w.heel_velocity))
-        rows.append(Term(*words, momentum_kept, upper=np.inf))
+        rows += [
+            follow("heel velocity", "WL-J3", "m/s", heel, w.heel_velocity),
+            Term("L at take-off", "WL-D1", "kg m^2/s", "end", momentum_kept, upper=np.inf),
+        ]
     return rows
 
 
