@@ -5,7 +5,7 @@ code where that applies.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import compress, pairwise
 from pathlib import Path
@@ -155,13 +155,13 @@ def _judged(clip: Clip) -> ClipReport:
     tape = dataclasses.replace(tape, tau=_of_motors(r))
     r = dataclasses.replace(r, tape=tape)
     falls = _free_falls(r, ground)
+    self_collision, _ = collisions(r)  # how near the body comes to the ground is no fault of it
     measures = [
         *_measures(r, ground, (height, depth, level), falls),
-        *map(_lasting(clip.fps), joints(r)),
-        *collisions(r),
+        *(_lasting(measure, clip.fps) for measure in joints(r)),
+        self_collision,
     ]
-    checks = _checks(measures, ALLOWED)
-    checks = tuple(c for c in checks if c.name != "body clearance")
+    checks = tuple(_checks(measures, ALLOWED))
     manifest = {
         "clip": clip.name,
         "format": clip.origin,
@@ -318,8 +318,7 @@ def _pushes(r: Replay, k: int, sides: np.ndarray) -> tuple[np.ndarray, np.ndarra
         force = np.tile(edges, (len(corners), 1))
         arms = np.repeat(corners, len(edges), axis=0)
         wrench = np.hstack([force, np.cross(arms - r.foot[k, side], force)]).T
-        frame = r.model.getFrameId(str(r.tape.contact_frames[side]))
-        slope = pin.getFrameJacobian(r.model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+        slope = pin.getFrameJacobian(r.model, data, r.frames[side], pin.LOCAL_WORLD_ALIGNED)
         base = np.vstack([force.T, np.cross(arms - r.com[k], force).T]) / r.weight
         parts.append((wrench, base, (slope.T @ wrench)[6:]))
     wrenches, base, torques = (np.hstack(x) for x in zip(*parts, strict=True))
@@ -351,20 +350,17 @@ def _measures(
     yield "unphysical moment", *_most(moment, t, METHOD.force_percent)
 
 
-def _lasting(fps: float) -> Callable[[Measure], Measure]:
-    """A function that makes torque shares (n, joints) of a measure the least over METHOD.lasting_s
-    around, and leaves other measures alone.
+def _lasting(measure: Measure, fps: float) -> Measure:
+    """A measure with torque shares (n, joints) that are the least over METHOD.lasting_s around;
+    others as they are.
     """
     from scipy.ndimage import minimum_filter1d  # slow to import
 
+    name, values, *more = measure
+    if name not in LASTING:
+        return measure
     size = max(METHOD.lasting_frames, round(METHOD.lasting_s * fps))
-
-    def least(measure: Measure) -> Measure:
-        name, values, *more = measure
-        values = minimum_filter1d(values, size, axis=0) if name in LASTING else values
-        return name, values, *more
-
-    return least
+    return name, minimum_filter1d(values, size, axis=0), *more
 
 
 def _inner(ground: np.ndarray, t: np.ndarray) -> np.ndarray:

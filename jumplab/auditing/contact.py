@@ -91,10 +91,7 @@ def collisions(r: Replay) -> Iterator[Measure]:
         for (i, a), (k, b) in combinations(shapes, 2)
         if a != b and parents[a] != b and parents[b] != a
     ]
-    feet = {
-        r.model.frames[r.model.getFrameId(str(n), pin.FrameType.BODY)].parentJoint
-        for n in r.tape.contact_frames
-    }
+    feet = {r.model.frames[k].parentJoint for k in r.frames}
     blocks = [(geometry.addGeometryObject(x), x.name) for x in _surroundings(r)]
     # feet stand on all but what they go over
     outer = [

@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.replay import Replay, carrying, norm, runs
+from jumplab.auditing.replay import Replay, norm, runs
 from jumplab.auditing.report import METHOD, Measure
-from jumplab.io.tape import Tape
+from jumplab.io.tape import AIR, Tape
 from jumplab.task import JumpTask
 
 
@@ -18,13 +18,13 @@ def form(tape: Tape) -> Iterator[Measure]:
     """Finite numbers, order of phases and times: without these nothing else can be computed."""
     arrays = (tape.t, tape.q, tape.v, tape.a, tape.tau, tape.f)
     yield "finite numbers", sum((~np.isfinite(x)).sum() for x in arrays)
-    phase = np.asarray(tape.phase)
-    flying = phase == "flight"
+    flying = tape.phase == "flight"
+    carrying = tape.contacts > AIR
     step = np.diff(tape.t)
-    doubled = flying[1:] != flying[:-1]
-    faults = [~flying & (phase != "launch"), flying[:1], carrying(tape).any(axis=1) == flying]
+    doubled = np.diff(flying)
+    faults = [~flying & (tape.phase != "launch"), flying[:1], carrying.any(axis=1) == flying]
     if "contacts" in tape.extra:  # where a foot lands an instant is there twice as well
-        doubled |= (np.diff(carrying(tape).astype(int), axis=0) > 0).any(axis=1)
+        doubled |= (carrying[1:] > carrying[:-1]).any(axis=1)
     else:
         faults.append(abs(doubled.sum() - 1))
     pieces = runs(np.cumsum([False, *doubled]))

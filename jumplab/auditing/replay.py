@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from jumplab.auditing.report import METHOD, of_size
 from jumplab.errors import InputError, RobotError
-from jumplab.io.tape import Tape
+from jumplab.io.tape import AIR, Tape
 from jumplab.robot import Robot
 from jumplab.robot.locked import LockedJoint
 from jumplab.robot.motors import SLIDING_RATE
@@ -33,6 +33,11 @@ def runs(values: np.ndarray) -> list[slice]:
     differ = (values[1:] != values[:-1]).reshape(len(values) - 1, -1).any(axis=1)
     edges = [0, *(np.flatnonzero(differ) + 1).tolist(), len(values)]
     return [slice(a, b) for a, b in pairwise(edges)]
+
+
+def spans(flags: np.ndarray) -> list[slice]:
+    """Rows of each run of true flags (N,)."""
+    return [rows for rows in runs(flags) if flags[rows.start]]
 
 
 class Sole(NamedTuple):
@@ -56,6 +61,7 @@ class Replay:
     over: Sequence[float] | None
     model: pin.Model  # built from the URDF alone, as the geometry
     geometry: pin.GeometryModel
+    frames: list[int]  # (K,) of the model, that the feet are
     soles: tuple[Sole, ...]  # one per contact frame
     com: np.ndarray  # (N, 3) [m], its velocity [m/s] and its acceleration [m/s^2]
     com_velocity: np.ndarray
@@ -108,7 +114,7 @@ class Replay:
     @cached_property
     def carrying(self) -> np.ndarray:
         """(N, K) whether a foot is on the ground, as the tape says; what it says is checked."""
-        return carrying(self.tape)
+        return self.tape.contacts > AIR
 
     @cached_property
     def ground(self) -> np.ndarray:
@@ -128,8 +134,7 @@ class Replay:
     @cached_property
     def stands(self) -> list[tuple[int, slice]]:
         """(foot, rows) of each contact."""
-        columns = enumerate(self.carrying.T)
-        return [(k, rows) for k, down in columns for rows in runs(down) if down[rows.start]]
+        return [(k, rows) for k, down in enumerate(self.carrying.T) for rows in spans(down)]
 
     @property
     def is_jump(self) -> bool:
@@ -214,14 +219,6 @@ class Replay:
         return np.concatenate([np.zeros_like(values[:1]), np.cumsum(areas, axis=0)])
 
 
-def carrying(tape: Tape) -> np.ndarray:
-    """(N, K) whether a foot is down: by the tape's ``contacts``, else all feet until take-off."""
-    contacts = tape.extra.get("contacts")
-    if isinstance(contacts, np.ndarray) and contacts.shape == tape.f.shape[:2]:
-        return contacts > 0
-    return np.repeat((np.asarray(tape.phase) != "flight")[:, None], tape.f.shape[1], axis=1)
-
-
 def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Model, list[int]]:
     """Pinocchio model, and contact frames; raises InputError if the tape does not fit."""
     try:
@@ -279,7 +276,8 @@ def replay(
     motion["tau"] += motors.armature * tape.a[:, 6:] + lost
     motion["energy"] += (motors.armature * rates**2).sum(axis=1) / 2
     soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
-    return Replay(tape, robot, task, edge_m, over, model, geometry, soles, lost=lost, **motion)
+    places = tape, robot, task, edge_m, over, model, geometry, frames, soles
+    return Replay(*places, lost=lost, **motion)
 
 
 def configured_sole(robot: Robot) -> Sole:
@@ -335,7 +333,7 @@ def _motion(
             # from the frame's origin in world axes to the joint that carries it
             contact = pin.SE3(np.eye(3), data.oMf[frame].translation).act(pin.Force(wrench))
             joint = model.frames[frame].parentJoint
-            external[joint] = external[joint] + data.oMi[joint].actInv(contact)
+            external[joint] += data.oMi[joint].actInv(contact)
         need = pin.rnea(model, inverse, q, v, a, external)
         about_com = pin.SE3(np.eye(3), data.com[0])
         row = {
