@@ -243,28 +243,30 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             one = ground[max(a - 1, 0)]
             steps = one.sum() == 1 and np.array_equal(one, ground[min(b, len(ground) - 1)])
             ground[a:b] = ~one if steps else False
-    rows = _merged(phases_of(ground, fps))
-    standing = [k for k, row in enumerate(rows) if row[0] == "LR"]
+    feet, times = _merged(phases_of(ground, fps))
+    standing = [k for k, x in enumerate(feet) if x == "LR"]
     if not standing:
         raise InputError(
             f"clip {before.clip.name!r}: it never stands on both feet, and a motion has to begin "
             f"so; give more of it"
         )
     # between long standing the motion that flies longest, else that of most phases
-    long = [k for k in standing[1:-1] if rows[k][2] - rows[k][1] > LONG_S]
+    lasts = np.diff(times)
+    flown = lasts * [x == FLIGHT for x in feet]
+    long = [k for k in standing[1:-1] if lasts[k] > LONG_S]
     ends = pairwise([standing[0], *long, standing[-1]])
-    parts = [rows[a : b + 1] for a, b in ends]
-    rows = max(parts, key=lambda x: (sum(b - a for f, a, b in x if f == FLIGHT), len(x)))
-    if len(rows) > 1:
-        rows[0][1] = max(rows[0][1], rows[0][2] - _standing_s(before, rows[0][2], -1))
-        rows[-1][2] = min(rows[-1][2], rows[-1][1] + _standing_s(before, rows[-1][1], 1))
-    for k in range(len(rows) - 1, 0, -1):
-        feet, a, b = rows[k - 1]
-        if rows[k][0] == FLIGHT:
-            rises = b - min(TOES_S, (b - a) / 2)
-            rows[k - 1][2] = rises
-            rows.insert(k, [feet.lower(), rises, b])
-    return [(feet, a, b) for feet, a, b in rows]
+    first, last = max(ends, key=lambda x: (sum(flown[slice(*x)]), x[1] - x[0]))
+    feet = feet[first : last + 1]
+    times = times[first : last + 2]
+    if last > first:
+        times[0] = max(times[0], times[1] - _standing_s(before, times[1], -1))
+        times[-1] = min(times[-1], times[-2] + _standing_s(before, times[-2], 1))
+    for k in range(len(feet) - 1, 0, -1):
+        if feet[k] == FLIGHT:
+            a, b = times[k - 1 : k + 1]
+            times.insert(k, b - min(TOES_S, (b - a) / 2))
+            feet.insert(k, feet[k - 1].lower())
+    return list(zip(feet, times[:-1], times[1:], strict=True))
 
 
 def _standing_s(before: ClipReport, event_s: float, way: int) -> float:
@@ -274,29 +276,34 @@ def _standing_s(before: ClipReport, event_s: float, way: int) -> float:
     return float(kept[np.argmin(np.interp(event_s + way * kept, before.clip.t, rates) + kept)])
 
 
-def _merged(phases: Sequence[tuple[str, float, float]]) -> list[list]:
-    """Phases without those too short to count, those on one foot first; their time goes to those
-    beside them, but to flights only what is between two of them.
+def _merged(phases: Sequence[tuple[str, float, float]]) -> tuple[list[str], list[float]]:
+    """Feet of n phases, and the n + 1 times [s] at which they begin and end, without those too
+    short to count, those on one foot first; their time goes to those beside them, but to flights
+    only what is between two of them.
     """
-    rows = [list(row) for row in phases]
+    feet = [x for x, _, _ in phases]
+    times = [phases[0][1], *(end for _, _, end in phases)]
     while True:
-        for k in range(len(rows) - 1, 0, -1):
-            if rows[k][0] == rows[k - 1][0]:
-                rows[k - 1][2] = rows.pop(k)[2]
-        short = [k for k, (_, a, b) in enumerate(rows) if b - a < _shortest(rows, k)]
-        if not short or len(rows) == 1:
-            return rows
-        k = min(short, key=lambda k: (rows[k][0] == "LR", rows[k][2] - rows[k][1]))
-        _, a, b = rows.pop(k)
-        if 0 < k < len(rows):
-            flies = [rows[k - 1][0] == FLIGHT, rows[k][0] == FLIGHT]
-            at = (a + b) / 2 if flies[0] == flies[1] else a if flies[0] else b
-            rows[k - 1][2] = rows[k][1] = at
+        for k in range(len(feet) - 1, 0, -1):
+            if feet[k] == feet[k - 1]:
+                del feet[k], times[k]
+        lasts = np.diff(times)
+        short = [k for k, x in enumerate(lasts) if x < _shortest(feet, k)]
+        if not short or len(feet) == 1:
+            return feet, times
+        k = min(short, key=lambda k: (feet[k] == "LR", lasts[k]))
+        del feet[k]
+        if k in (0, len(feet)):
+            del times[0 if k == 0 else -1]
+            continue
+        a, b = times[k : k + 2]
+        before, after = (x == FLIGHT for x in feet[k - 1 : k + 1])
+        times[k : k + 2] = [(a + b) / 2 if before == after else a if before else b]
 
 
-def _shortest(rows: list[list], k: int) -> float:
-    """The least time [s] that phase ``k`` of (feet, from, to) has to last to count."""
-    beside = [row[0] for row in rows[max(k - 1, 0) : k + 2]]
+def _shortest(feet: list[str], k: int) -> float:
+    """The least time [s] that phase ``k`` on these ``feet`` has to last to count."""
+    beside = feet[max(k - 1, 0) : k + 2]
     return SHUFFLED_S if beside in (["LR", "L", "LR"], ["LR", "R", "LR"]) else MERGED_S
 
 
@@ -402,11 +409,12 @@ class Draft:
         return holds
 
     def _contacts(self, factor: float) -> Contacts:
-        first = []
         places = []
         phases = []
-        for k, (feet, a, b) in enumerate(self.phases):
+        held: dict[int, np.ndarray] = {}
+        for hold, (feet, a, b) in zip(self.holds, self.phases, strict=True):
             lasts = b - a
+            lands = hold.keys() - held.keys()
             if feet == FLIGHT:
                 kind = FLIGHT
                 lasts *= math.sqrt(factor)
@@ -415,19 +423,16 @@ class Draft:
                 low, high = (lasts * x for x in FLIGHT_STRETCH)
                 high = max(high, SHORT_FLIGHT_S)
             else:
-                lands = k and self.holds[k].keys() - self.holds[k - 1].keys()
-                kind = "toe" if feet.islower() else "landing" if lands else "flat"
+                kind = "toe" if feet.islower() else "landing" if phases and lands else "flat"
                 low, high = (lasts * x for x in STRETCH)
             steps = min(MOST_STEPS, max(LEAST_STEPS, math.ceil(lasts / STEPS_S[kind])))
             phases.append(ContactPhase(feet, (low, high), lasts, steps))
-            for side, hold in self.holds[k].items():
-                if k and side in self.holds[k - 1]:
-                    continue
-                ahead, left = hold[:2] - self.body.places[side][:2]
-                free = ((0.0, 0.0), 0.0) if self.goal or not k else (FREE_M, FREE_RAD)
-                place = Place(float(ahead), float(left), float(hold[3]), 0.0, *free)
-                (places if k else first).append(place)
-        return Contacts(tuple(phases), tuple(places), first=tuple(first))
+            for side in sorted(lands):
+                ahead, left = hold[side][:2] - self.body.places[side][:2]
+                free = ((0.0, 0.0), 0.0) if self.goal or len(places) < 2 else (FREE_M, FREE_RAD)
+                places.append(Place(float(ahead), float(left), float(hold[side][3]), 0.0, *free))
+            held = hold
+        return Contacts(tuple(phases), tuple(places[2:]), first=tuple(places[:2]))
 
     def _along(self) -> Motion:
         """The clip along the schedule, feet that carry in their places; it begins at rest above
@@ -435,40 +440,25 @@ class Draft:
         """
         from scipy.ndimage import gaussian_filter1d  # slow to import
 
-        drawn = [self.sampled(k, p.intervals + 1) for k, p in enumerate(self.contacts.phases)]
-        nodes = [(k, i) for k, rows in enumerate(drawn) for i in range(len(rows))]
-        down = np.array([self._lower(drawn[k][i], k, i) for k, i in nodes])
+        sizes = [p.intervals + 1 for p in self.contacts.phases]
+        nodes = [(k, i) for k, size in enumerate(sizes) for i in range(size)]
+        clip = np.concatenate([self.sampled(k, size) for k, size in enumerate(sizes)])
+        down = np.array([self._lower(x, *node) for x, node in zip(clip, nodes, strict=True)])
+        charts = clip.copy()
         smooth = gaussian_filter1d(np.nan_to_num(down), SMOOTH_FRAMES)
-        missed = 0.0
-        for (k, i), less, least in zip(nodes, smooth, down, strict=True):
-            drawn[k][i, 2] -= np.fmax(less, least)
-            drawn[k][i], left = self._placed(drawn[k][i], k, i)
-            missed = max(missed, left)
-        start = drawn[0][0] = self._start(drawn[0][0])
-        self.start = configurations(self.body.model, start[None])[0]
+        charts[:, 2] -= np.fmax(smooth, down)
+        placed = [self._placed(x, *node) for x, node in zip(charts, nodes, strict=True)]
+        charts = np.array([x for x, _ in placed])
+        charts[0] = self._start(charts[0])
+        self.start = configurations(self.body.model, charts[:1])[0]
         durations = np.array([p.guess_s for p in self.contacts.phases])
-        motion = Motion(durations, drawn, missed)
-        self._fade(motion)
-        return motion
-
-    def _fade(self, motion: Motion) -> None:
-        """Change the charts of a motion over :data:`FADE_S` after feet leave and before they land,
-        so that no leg jumps from the clip's posture to that which has its foot in place.
-        """
-        rows = [(k, i) for k, charts in enumerate(motion.charts) for i in range(len(charts))]
-        ends = pairwise(motion.starts)
-        sizes = map(len, motion.charts)
-        t = np.concatenate([np.linspace(*x, n) for x, n in zip(ends, sizes, strict=True)])
-        moved = np.concatenate([q - self.sampled(k, len(q)) for k, q in enumerate(motion.charts)])
+        ends = np.cumsum(durations)
+        t = np.concatenate([*map(np.linspace, ends - durations, ends, sizes)])
         for side, columns in enumerate(self.body.legs):
-            in_air = [side not in modes_of(self.phases[k][0]) for k, _ in rows]
-            for first, end in spans(in_air):
-                for event in {first - 1, end} - {-1, len(rows)}:
-                    for row in range(first, end):
-                        k, i = rows[row]
-                        left = max(0.0, 1 - abs(t[row] - t[event]) / FADE_S)
-                        share = left**2 * (3 - 2 * left)
-                        motion.charts[k][i, columns] += share * moved[event, columns]
+            in_air = [side not in modes_of(self.phases[k][0]) for k, _ in nodes]
+            charts[:, columns] += faded(charts[:, columns] - clip[:, columns], t, in_air)
+        drawn = np.split(charts, np.cumsum(sizes)[:-1])
+        return Motion(durations, drawn, max(missed for _, missed in placed))
 
     def sampled(self, k: int, count: int) -> np.ndarray:
         """Charts (``count``, 6 + joints) of the clip, evenly over phase ``k``."""
@@ -538,6 +528,19 @@ class Draft:
             heel = HEEL_UP * (i / self.contacts.phases[k].intervals) ** 2 * (mode == "toe")
             goals[side] = pin.SE3(pin.rpy.rpyToMatrix(0.0, heel, yaw), np.array(place))
         return self.reach(chart, goals, list(modes))
+
+
+def faded(moved: np.ndarray, t: np.ndarray, in_air: Sequence[bool]) -> np.ndarray:
+    """Changes (n, joints) of a leg ``in_air`` (n,) over :data:`FADE_S` after its foot leaves and
+    before it lands, at times ``t`` (n,) [s], so that it does not jump from the clip's posture to
+    that which has its foot in place, ``moved`` (n, joints) off the clip's.
+    """
+    changes = np.zeros_like(moved)
+    for first, end in spans(in_air):
+        for event in {first - 1, end} - {-1, len(t)}:
+            left = np.maximum(0.0, 1 - np.abs(t[first:end] - t[event]) / FADE_S)
+            changes[first:end] += (left**2 * (3 - 2 * left))[:, None] * moved[event]
+    return changes
 
 
 def _level(charts: np.ndarray, before: ClipReport) -> np.ndarray:
