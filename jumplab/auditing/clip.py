@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import compress, pairwise
+from itertools import compress, pairwise, starmap
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +161,7 @@ def _judged(clip: Clip) -> ClipReport:
         *(_lasting(measure, clip.fps) for measure in joints(r)),
         self_collision,
     ]
-    checks = tuple(_checks(measures, ALLOWED))
+    checks = tuple(_checks(starmap(r.named, measures), ALLOWED))
     manifest = {
         "clip": clip.name,
         "format": clip.origin,
@@ -334,20 +334,18 @@ def _measures(
     how deep in it, and how high it would stand [m].
     """
     height, depth, level = places
-    t = r.tape.t
-    feet = r.tape.contact_frames
-    standing = _inner(ground, t)
+    standing = _inner(ground, r.tape.t)
     floating = np.where(standing, height, -np.inf)
-    yield "standing feet float", *_most(floating, t, METHOD.float_percent), feet
-    yield "feet in the ground", depth, t, feet
+    yield "standing feet float", _most(floating, METHOD.float_percent)
+    yield "feet in the ground", depth
     near = standing & (height - level < METHOD.near_m)
-    yield "feet on the ground slide", *_most(_sliding(r, near), t, METHOD.slide_percent), feet
+    yield "feet on the ground slide", _most(_sliding(r, near), METHOD.slide_percent)
     deviations = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
     yield "flights fall freely", deviations, [times[0] for times, _, _ in falls]
     missing = norm(r.base_residual[:, :3]) / r.weight
-    yield "unphysical force", *_most(missing, t, METHOD.force_percent)
+    yield "unphysical force", _most(missing, METHOD.force_percent)
     moment = norm(r.base_residual[:, 3:]) / r.weight
-    yield "unphysical moment", *_most(moment, t, METHOD.force_percent)
+    yield "unphysical moment", _most(moment, METHOD.force_percent)
 
 
 def _lasting(measure: Measure, fps: float) -> Measure:
@@ -380,12 +378,12 @@ def _series(r: Replay) -> dict[str, np.ndarray]:
     }
 
 
-def _most(values: np.ndarray, t: np.ndarray, percent: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values (n, ...) without their largest, beyond a percentile; and their times."""
-    if not np.isfinite(values).any():
-        return values[:0], t[:0]
-    most = np.percentile(values[np.isfinite(values)], percent)
-    return np.where(values <= most, values, -np.inf), t
+def _most(values: np.ndarray, percent: float) -> np.ndarray:
+    """Values (n, ...) without their largest, beyond a percentile; none if none are finite."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return finite
+    return np.where(values <= np.percentile(finite, percent), values, -np.inf)
 
 
 def _sliding(r: Replay, ground: np.ndarray) -> np.ndarray:

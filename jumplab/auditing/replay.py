@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
-from jumplab.auditing.report import METHOD, of_size
+from jumplab.auditing.report import METHOD, Measure, of_size
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import AIR, Tape
 from jumplab.robot import Robot
@@ -211,6 +212,25 @@ class Replay:
         ahead = self.heading * (np.asarray(x) - self.edge)
         beyond = ahead > -1e-9 if self.platform > 0 else ahead > 1e-9
         return np.where(beyond, self.platform, 0.0)
+
+    def named(
+        self,
+        name: str,
+        values: ArrayLike,
+        t: ArrayLike | None = None,
+        numbers: Mapping[str, float | str] | None = None,
+        labels: Sequence[str] | None = None,
+    ) -> Measure:
+        """A measure as :meth:`.Limit.check` takes it: values with N rows are of all samples; (M, K)
+        are of the feet, (M, nv - 6) of the joints and (M, nv) of the coordinates.
+        """
+        x = np.asarray(values, float)
+        if t is None and x.shape[:1] == self.tape.t.shape:
+            t = self.tape.t
+        if labels is None and x.ndim == 2:
+            columns = self.tape.contact_frames, self.joints, self.coordinates
+            labels = {len(names): names for names in columns}.get(x.shape[1])
+        return name, x, t, labels, vars(self.method) | (numbers or {})
 
     def integral(self, values: np.ndarray) -> np.ndarray:
         """Running trapezoid integral over time of (N,) or (N, M) values, zero in the first row."""
