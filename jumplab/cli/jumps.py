@@ -27,9 +27,9 @@ def plan(args: Namespace) -> None:
     task = JumpTask(**given(JumpTask, args))
     if args.contacts:
         why = "cannot be used with --contacts, which gives a schedule instead of a target"
-        without(args, why, **{f.name: f.default for f in fields(JumpTask)[2:]})
-        without(args, why, distance_m=1.0, height_m=0.5, like=None)
-        without(args, why, robust=False, atlas=None, starts=1)
+        usual = {f.name: f.default for f in fields(JumpTask)[2:]}
+        usual |= {"distance_m": 1.0, "height_m": 0.5, "like": None}
+        without(args, why, **usual, robust=False, atlas=None, starts=1)
         task = None
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
     ranges = None

@@ -215,7 +215,7 @@ def atlas(args: Namespace) -> None:
 
 def choices_of(option: str, pairs: list[str]) -> list[dict[str, float]]:
     """All combinations of what was given as NAME=VALUES, several times."""
-    choices: list[dict[str, float]] = [{}]
+    choices = [{}]
     for pair in pairs:
         name, text = named(f"{option}=A,B,...", pair)
         each = values_of(f"{option.split()[0]} {name}", text)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 from jumplab.arguments import checked
@@ -92,7 +93,7 @@ class Envelope(Shown):
 
     def _greatest(self, *names: str) -> Cell | None:
         solved = (c for c in self.cells if c.solved)
-        return max(solved, key=lambda c: [getattr(c, name) for name in names], default=None)
+        return max(solved, key=attrgetter(*names), default=None)
 
 
 @checked

@@ -18,6 +18,7 @@ import pinocchio as pin
 
 from jumplab.arguments import checked
 from jumplab.auditing.clip import ClipReport, judge, phases_of
+from jumplab.control.kinematics import about_vertical
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, require_type
 from jumplab.io.clip import Clip
 from jumplab.io.progress import tell
@@ -353,7 +354,7 @@ class Draft:
         takeoff, landing = (self.middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
         turn = goal.yaw_rad - (landing[2] - takeoff[2])
         way = np.add(takeoff[:2], [goal.distance_m, goal.side_m])
-        back = pin.rpy.rpyToMatrix(0.0, 0.0, turn)[:2, :2].T
+        back = about_vertical(turn)[:2, :2].T
 
         def there(x: np.ndarray) -> np.ndarray:
             return (x - landing[:2]) @ back + way
@@ -390,7 +391,7 @@ class Draft:
         middle = np.median((origin + turn @ self.clip.robot.foot.center).mean(axis=1), axis=0)
         ahead = turn[..., 0].mean(axis=(0, 1))
         angle = math.atan2(ahead[1], ahead[0])
-        back = pin.rpy.rpyToMatrix(0.0, 0.0, -angle)[:2, :2]
+        back = about_vertical(-angle)[:2, :2]
         out = charts.copy()
         out[:, :2] = (charts[:, :2] - middle[:2]) @ back.T
         out[:, 3] -= angle
@@ -399,7 +400,7 @@ class Draft:
 
     def _holds(self) -> list[dict[int, np.ndarray]]:
         """Of each phase, side -> x, y, z, yaw of the feet that carry: medians over the contact."""
-        holds: list[dict[int, np.ndarray]] = [{} for _ in self.phases]
+        holds = [{} for _ in self.phases]
         for side in (0, 1):
             for first, end in spans([side in modes_of(feet) for feet, _, _ in self.phases]):
                 rows = slice(self._rows(first).start, self._rows(end - 1).stop)
@@ -411,7 +412,7 @@ class Draft:
     def _contacts(self, factor: float) -> Contacts:
         places = []
         phases = []
-        held: dict[int, np.ndarray] = {}
+        held = {}
         for hold, (feet, a, b) in zip(self.holds, self.phases, strict=True):
             lasts = b - a
             lands = hold.keys() - held.keys()
@@ -592,16 +593,12 @@ def _changes(before: ClipReport, draft: Draft, plan: JumpPlan) -> list[dict[str,
         "footholds, largest [m]": max(moved),
     }
     rows = [{"what": name, "change": float(x)} for name, x in changes.items()]
-    flown_s = [b - a for feet, a, b in draft.phases if feet == FLIGHT]
-    pairs = zip(phases, plan.contacts.phases, strict=True)
-    times_s = [x.duration for x, contact in pairs if contact.flying]
+    pairs = zip(draft.phases, phases, strict=True)
+    flown_s = [(b - a, x.duration) for (feet, a, b), x in pairs if feet == FLIGHT]
     com = plan.tape.extra["com"][:, 2]
     rises_m = [flight["rise_m"] for flight in before.manifest["flights"]]
     risen_m = [com[x].max() - com[x.start] for x in plan.tape.flights]
-    both = {
-        "flight {} [s]": zip(flown_s, times_s, strict=True),
-        "rise {} [m]": zip(rises_m, risen_m, strict=False),
-    }
+    both = {"flight {} [s]": flown_s, "rise {} [m]": zip(rises_m, risen_m, strict=False)}
     for what, values in both.items():
         for i, (clip, mended) in enumerate(values, 1):
             row = {"what": what.format(i), "clip": clip, "mended": float(mended)}

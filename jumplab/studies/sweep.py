@@ -213,8 +213,7 @@ def _thinned(tape: Tape, hz: float) -> bytes:
     times = np.arange(0.0, tape.t[-1], 1 / hz)
     rows = np.unique(np.searchsorted(tape.t, times).clip(0, len(tape.t) - 1))
     columns = {n: getattr(tape, n)[rows].astype(np.float32) for n in ("t", "q", "v", "tau")}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, flying=tape.phase[rows] == "flight", **columns)
+    np.savez_compressed(buffer := io.BytesIO(), flying=tape.phase[rows] == "flight", **columns)
     return buffer.getvalue()
 
 

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
 from jumplab.control import STAND_S, STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.controller import Controller, Hardware
-from jumplab.control.kinematics import Gauge, State, headed, yaw_of
+from jumplab.control.kinematics import Gauge, State, about_vertical, headed, yaw_of
 from jumplab.control.landing import LandingController
 from jumplab.control.servo import Drive
 from jumplab.io.tape import Tape
@@ -271,5 +271,5 @@ def _standing(gauge: Gauge, q: np.ndarray) -> list[pin.SE3]:
     places = []
     for foot, sole in zip(feet, soles - soles.mean(axis=0), strict=True):
         yaw = np.arctan2(foot.rotation[1, 0], foot.rotation[0, 0])
-        places.append(pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), sole))
+        places.append(pin.SE3(about_vertical(yaw), sole))
     return places
