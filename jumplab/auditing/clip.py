@@ -118,12 +118,11 @@ def judge(
     order : of joints without names, "depth-first" or "breadth-first".
     platform_m : height of a platform on which feet may stand as well [m]; that of a plan is known.
     """
-    known = {} if platform_m is None else {"platform_m": platform_m}
     if isinstance(motion, Clip):
-        return _judged(dataclasses.replace(motion, **known))
+        return _judged(motion, platform_m)
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
     if not isinstance(motion, str | Path):
-        return _judged(dataclasses.replace(Clip.of(motion, robot, fps), **known))
+        return _judged(Clip.of(motion, robot, fps), platform_m)
     path = as_path(motion, "a clip")
     paths = [path]
     if path.is_dir():
@@ -133,11 +132,13 @@ def judge(
                 f"{path}: holds no file that ends in {', '.join(ENDINGS)}; give a folder of clips"
             )
     clips = [clip for one in paths for clip in read_clips(one, robot, fps=fps, order=order)]
-    reports = [_judged(dataclasses.replace(clip, **known)) for clip in clips]
+    reports = [_judged(clip, platform_m) for clip in clips]
     return reports if path.is_dir() or len(reports) > 1 else reports[0]
 
 
-def _judged(clip: Clip) -> ClipReport:
+def _judged(clip: Clip, platform_m: float | None) -> ClipReport:
+    if platform_m is not None:
+        clip = dataclasses.replace(clip, platform_m=platform_m)
     bare = tape_of(clip)
     r = replay(bare, clip.robot, None)
     z = r.sole_points[..., 2].min(axis=2)
@@ -176,11 +177,10 @@ def _judged(clip: Clip) -> ClipReport:
             for t, a, up in falls
         ],
         "versions": versions(),
+        "phases": [list(phase) for phase in phases_of(ground, clip.fps)],
     }
     fields = {"clip": clip, "tape": tape, "ground": ground, "still": still}
-    report = ClipReport(checks, manifest, **fields, series=_series(r))
-    manifest["phases"] = [list(phase) for phase in report.phases]
-    return report
+    return ClipReport(checks, manifest, **fields, series=_series(r))
 
 
 def _width(fps: float) -> float:

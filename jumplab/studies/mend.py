@@ -139,7 +139,7 @@ def mend(
         If no motion near it keeps the limits; says which forbid it, and the largest part of the
         clip (in way, turn and height) that can be done.
     """
-    before = _judged(motion, robot, fps, order)
+    before = _judged(motion, robot, fps=fps, order=order)
     planner = Planner(before.clip.robot, keep=True, weights=weights, limits=limits)
     try:
         return _mended(planner, before)
@@ -167,10 +167,7 @@ def mend(
 def like(
     task: JumpTask,
     motion: Any,
-    robot: Robot | str = "bhr",
-    *,
-    fps: float | None = None,
-    order: str = "depth-first",
+    robot: Robot | str | Path = "bhr",
     **changes: Any,
 ) -> JumpPlan:
     """A jump to a target in the manner of a clip: its joints, its feet, its times on the ground.
@@ -178,8 +175,8 @@ def like(
     Parameters
     ----------
     task : travel and rise [m], and turn [rad], on level ground.
-    motion, robot, fps, order, changes : as of :func:`mend`; the clip jumps once, off both feet and
-        down on both.
+    motion, robot : as of :func:`mend`; the clip jumps once, off both feet and down on both.
+    changes : as of :class:`jumplab.Planner`.
 
     Raises
     ------
@@ -191,7 +188,7 @@ def like(
             "a jump like a clip needs level ground and no flip; set platform_m and rotation_rad "
             "to 0"
         )
-    before = _judged(motion, robot, fps, order)
+    before = _judged(motion, robot)
     draft = Draft(before, goal=task)
     return Planner(before.clip.robot, keep=True, **changes).follow(
         draft.contacts,
@@ -203,10 +200,10 @@ def like(
     )
 
 
-def _judged(motion: Any, robot: Robot | str, fps: float | None, order: str) -> ClipReport:
+def _judged(motion: Any, robot: Robot | str | Path, **options: Any) -> ClipReport:
     """The report of one clip, or that which is given."""
     if not isinstance(motion, ClipReport):
-        motion = judge(motion, robot, fps=fps, order=order)
+        motion = judge(motion, robot, **options)
     require_type(motion, ClipReport, "one clip")
     return motion
 
