@@ -254,9 +254,9 @@ def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Mode
             "the jump again with this robot"
         )
     frames = list(map(str, tape.contact_frames))
-    widths = {"q": model.nq, "v": model.nv, "a": model.nv, "tau": model.nv - 6}
-    needed = {name: (len(tape.t), width) for name, width in widths.items()}
-    for name, shape in (needed | {"f": (len(tape.t), len(frames), 6)}).items():
+    widths = {"q": [model.nq], "v": [model.nv], "a": [model.nv], "tau": [model.nv - 6]}
+    for name, width in {**widths, "f": [len(frames), 6]}.items():
+        shape = (len(tape.t), *width)
         given = getattr(tape, name).shape
         if given != shape:
             raise InputError(

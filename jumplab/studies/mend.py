@@ -67,6 +67,7 @@ FADE_S = 0.2  # in which a leg in the air leaves what holds its foot in place, o
 LEAST_RISE_M = 0.02  # of a clip's flight, to be scaled
 RISE_WEIGHT = 1e5  # [1] / [m/s]^2, of the take-off speed that a target asks for
 FACTORS = (0.8, 0.6, 0.4)  # of what cannot be mended
+POSE = [0, 1, 3]  # x, y and yaw, of charts and of feet
 
 
 @dataclass(frozen=True, repr=False)
@@ -349,26 +350,24 @@ class Draft:
                 f"needs a clip that flies once, takes off from both feet and lands on both"
             )
         takeoff, landing = (self.middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
-        turn = goal.yaw_rad - (landing[2] - takeoff[2])
-        way = np.add(takeoff[:2], [goal.distance_m, goal.side_m])
-        back = about_vertical(turn)[:2, :2].T
+        target = np.add(takeoff, [goal.distance_m, goal.side_m, goal.yaw_rad])
+        turn = about_vertical(target[2] - landing[2])
 
-        def there(x: np.ndarray) -> np.ndarray:
-            return (x - landing[:2]) @ back + way
+        def there(poses: np.ndarray) -> np.ndarray:
+            return (poses - landing) @ turn.T + target
 
         _, begin, end = self.phases[k]
-        share = np.clip((self.clip.t - begin) / (end - begin), 0.0, 1.0)[:, None]
+        share = np.clip((self.clip.t - begin) / (end - begin), 0.0, 1.0)
         x = self.charts
-        x[:, :2] += share * (there(x[:, :2]) - x[:, :2])
-        x[:, 3] += share[:, 0] * turn
+        x[:, POSE] += share[:, None] * (there(x[:, POSE]) - x[:, POSE])
         rises_m = [flight["rise_m"] for flight in before.manifest["flights"]]
         line = np.interp(self.clip.t, [begin, end], np.interp([begin, end], self.clip.t, x[:, 2]))
         flown = (share > 0) & (share < 1)
         more = goal.height_m / max([*rises_m, LEAST_RISE_M]) - 1
-        x[:, 2] += flown[:, 0] * more * (x[:, 2] - line)
+        x[:, 2] += flown * more * (x[:, 2] - line)
         for hold in self.holds[k + 1 :]:
-            for side, place in hold.items():
-                hold[side] = np.array([*there(place[:2]), 0.0, place[3] + turn])
+            for place in hold.values():
+                place[POSE] = there(place[POSE])
 
     def middle(self, hold: dict[int, np.ndarray]) -> np.ndarray:
         """x, y of the middle between the soles in their places [m], and their mean yaw [rad]."""
@@ -388,10 +387,8 @@ class Draft:
         middle = np.median((origin + turn @ self.clip.robot.foot.center).mean(axis=1), axis=0)
         ahead = turn[..., 0].mean(axis=(0, 1))
         angle = math.atan2(ahead[1], ahead[0])
-        back = about_vertical(-angle)[:2, :2]
         out = charts.copy()
-        out[:, :2] = (charts[:, :2] - middle[:2]) @ back.T
-        out[:, 3] -= angle
+        out[:, POSE] = (charts[:, POSE] - [*middle[:2], angle]) @ about_vertical(-angle).T
         out[:, 3] -= 2 * np.pi * np.round(out[first.start, 3] / (2 * np.pi))
         return out
 
@@ -401,9 +398,9 @@ class Draft:
         for side in (0, 1):
             for first, end in spans([side in modes_of(feet) for feet, _, _ in self.phases]):
                 rows = slice(self._rows(first).start, self._rows(end - 1).stop)
-                x, y, _, yaw = np.median(self.feet[rows, side], axis=0)
+                place = np.median(self.feet[rows, side], axis=0)
                 for hold in holds[first:end]:
-                    hold[side] = np.array([x, y, 0.0, yaw])
+                    hold[side] = place * [1.0, 1.0, 0.0, 1.0]  # on the floor
         return holds
 
     def _contacts(self, factor: float) -> Contacts:
@@ -561,10 +558,8 @@ def _scaled(charts: np.ndarray, first: slice, factor: float) -> np.ndarray:
     """Charts with a ``factor`` of their way, turn and height over where they begin."""
     out = charts.copy()
     start = charts[first].mean(axis=0)
-    for column in (0, 1, 3):
-        out[:, column] = start[column] + factor * (charts[:, column] - start[column])
-    high = np.maximum(charts[:, 2] - start[2], 0.0)
-    out[:, 2] -= (1 - factor) * high
+    out[:, POSE] = start[POSE] + factor * (charts - start)[:, POSE]
+    out[:, 2] -= (1 - factor) * np.maximum(charts[:, 2] - start[2], 0.0)
     return out
 
 
