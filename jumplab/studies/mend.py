@@ -513,11 +513,10 @@ class Draft:
         modes = modes_of(self.phases[k][0])
         if not modes:
             return chart, 0.0
-        origin, turn = feet_of(self.clip.robot, configurations(self.body.model, chart[None]))
-        goals = [
-            pin.SE3(turn[0, side], origin[0, side] + turn[0, side] @ self.clip.robot.foot.tip)
-            for side in (0, 1)
-        ]
+        data = self.reach.data
+        q = configurations(self.body.model, chart[None])[0]
+        pin.forwardKinematics(self.body.model.model, data, q)
+        goals = [foot.place(data) for foot in self.reach.feet]
         for side, mode in modes.items():
             *place, yaw = self.holds[k][side]
             heel = HEEL_UP * (i / self.contacts.phases[k].intervals) ** 2 * (mode == "toe")
