@@ -13,6 +13,8 @@ from jumplab.auditing.report import METHOD, Measure
 from jumplab.io.tape import AIR, Tape
 from jumplab.task import JumpTask
 
+DEGREES = np.degrees(1.0)  # a radian
+
 
 def form(tape: Tape) -> Iterator[Measure]:
     """Finite numbers, order of phases and times: without these nothing else can be computed."""
@@ -179,7 +181,7 @@ def _place(r: Replay, task: JumpTask) -> Iterator[Measure]:
     yield "place", norm((last - goal)[None, :, :2]), end, numbers
     side = r.foot_rotation[..., :, 1]  # level in a flip too
     yaw = _turned(-side[..., 0], side[..., 1])
-    yield "heading", np.abs(yaw - task.yaw_rad)[None], end, _degrees(yaw, task.yaw_rad)
+    yield _off("heading", yaw, task.yaw_rad, end, DEGREES)
 
 
 def _asked(r: Replay, task: JumpTask) -> Iterator[Measure]:
@@ -190,9 +192,7 @@ def _asked(r: Replay, task: JumpTask) -> Iterator[Measure]:
     else:
         yield from _place(r, task)
     yield from _risen(r, task, slice(r.flights[0].start, None))
-    turn = foot_turn(r)
-    numbers = _degrees(turn, task.rotation_rad)
-    yield "rotation", np.abs(turn - task.rotation_rad)[None], r.tape.t[-1:], numbers
+    yield _off("rotation", foot_turn(r), task.rotation_rad, r.tape.t[-1:], DEGREES)
 
 
 def _risen(r: Replay, task: JumpTask, flight: slice) -> Iterator[Measure]:
@@ -200,8 +200,7 @@ def _risen(r: Replay, task: JumpTask, flight: slice) -> Iterator[Measure]:
     height = r.com[flight, 2]
     highest = int(np.argmax(height))
     rise = height[highest] - height[0]
-    numbers = {"found": rise, "asked": task.height_m}
-    yield "rise", abs(rise - task.height_m), r.tape.t[flight][highest], numbers
+    yield _off("rise", rise, task.height_m, r.tape.t[flight][highest])
 
 
 def _flown(r: Replay, task: JumpTask) -> Iterator[Measure]:
@@ -211,10 +210,13 @@ def _flown(r: Replay, task: JumpTask) -> Iterator[Measure]:
     row = r.flights[-1].start
     ahead = r.toe_corners[[row, -1], ..., 0].mean(axis=-1) - r.toe_corners[0, ..., 0].mean(axis=-1)
     flown = ahead[1] - ahead[0, r.carrying[row - 1]].mean()
-    numbers = {"found": flown.mean(), "asked": task.distance_m}
-    yield "distance", np.abs(flown - task.distance_m)[None], r.tape.t[-1:], numbers
+    yield _off("distance", flown, task.distance_m, r.tape.t[-1:])
     yield from _risen(r, task, r.flights[-1])
 
 
-def _degrees(turn: np.ndarray, asked: float) -> dict[str, float]:
-    return dict(zip(("found", "asked"), np.degrees([turn.mean(), asked]), strict=True))
+def _off(name: str, found: np.ndarray, asked: float, t: np.ndarray, unit: float = 1.0) -> Measure:
+    """What was ``found``, () or (K,) of each foot, at ``t`` [s], against what was asked; the note
+    has both, times ``unit``.
+    """
+    numbers = {"found": unit * found.mean(), "asked": unit * asked}
+    return name, np.abs(found - asked)[None], t, numbers
