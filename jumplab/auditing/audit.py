@@ -91,8 +91,8 @@ def write_audit(folder: str | Path) -> AuditReport:
     tell("audit")
     tape, robot, summary = read_plan(folder)
     task = JumpTask.of(summary["target"])
-    ground = {"edge_m": summary.get("platform_edge_m"), "over": summary.get("over")}
-    report = audit(tape, robot, task, **ground)
+    edge_m = summary.get("platform_edge_m")
+    report = audit(tape, robot, task, edge_m=edge_m, over=summary.get("over"))
     manifest = {**report.manifest, "plan_sha256": sha256(Path(folder, PLAN)), "planner": summary}
     report = dataclasses.replace(report, manifest=manifest)
     with transaction(folder) as staging:

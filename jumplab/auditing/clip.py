@@ -179,8 +179,9 @@ def _judged(clip: Clip, platform_m: float | None) -> ClipReport:
         "versions": versions(),
         "phases": [list(phase) for phase in phases_of(ground, clip.fps)],
     }
-    fields = {"clip": clip, "tape": tape, "ground": ground, "still": still}
-    return ClipReport(checks, manifest, **fields, series=_series(r))
+    return ClipReport(
+        checks, manifest, clip=clip, tape=tape, ground=ground, still=still, series=_series(r)
+    )
 
 
 def _width(fps: float) -> float:

@@ -64,8 +64,7 @@ def values_of(option: str, text: str) -> list[float]:
         raise InputError(
             f"{option} must be {VALUES} with COUNT from 1 to {MOST_VALUES}, got {text!r}"
         )
-    first = number(option, parts[0])
-    last = number(option, parts[1])
+    first, last = (number(option, part) for part in parts[:2])
     count = int(parts[2])
     return [round(first + (last - first) * k / max(count - 1, 1), 9) for k in range(count)]
 

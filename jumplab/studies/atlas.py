@@ -129,10 +129,12 @@ class Atlas:
             return there
 
         grid = [[JumpTask(distance, height) for distance in distances] for height in heights]
-        options = {"jobs": jobs, "progress": progress}
         work = partial(node_row, planner)
         known = "node", atlas.key
-        for task, row in plan_rows(grid, work, known, "planned", folder, "atlas", **options):
+        rows = plan_rows(
+            grid, work, known, "planned", folder, "atlas", jobs=jobs, progress=progress
+        )
+        for task, row in rows:
             if row and row["planned"]:
                 place = task.distance_m, task.height_m
                 atlas.nodes[place] = Node(*place, row["cost"], np.array(row["x"]))

@@ -132,9 +132,10 @@ def envelope(
     if atlas is not None:
         atlas.require(planner.stage("direct"))
     known = "direct", robot.hash, atlas and atlas.hash
-    options = {"jobs": jobs, "progress": progress}
     work = partial(cell_row, planner)
-    results = plan_rows(rows, work, known, "clean", folder, "envelope", **options)
+    results = plan_rows(
+        rows, work, known, "clean", folder, "envelope", jobs=jobs, progress=progress
+    )
     cells = tuple(Cell.of(*result) for result in results)
     return Envelope(robot.name, distances, heights, cells, axes)
 
