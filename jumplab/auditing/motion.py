@@ -215,8 +215,8 @@ def _flown(r: Replay, task: JumpTask) -> Iterator[Measure]:
 
 
 def _off(name: str, found: np.ndarray, asked: float, t: np.ndarray, unit: float = 1.0) -> Measure:
-    """What was ``found``, () or (K,) of each foot, at ``t`` [s], against what was asked; the note
-    has both, times ``unit``.
+    """Measure of a number ``found`` at ``t`` [s], () or (K,) of each foot, against the one that was
+    asked for; the note has both, times ``unit``.
     """
     numbers = {"found": unit * found.mean(), "asked": unit * asked}
     return name, np.abs(found - asked)[None], t, numbers
