@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import starmap
 from pathlib import Path
 
 from jumplab.arguments import checked
@@ -65,8 +66,9 @@ def audit(
     if all(c.passed for c in checks):
         r = replay(tape, robot, task, edge_m, over)
         limits = of_size(robot)[1]
-        checks += _checks((measure for group in GROUPS for measure in group(r)), limits)
-        capture = _checks(motion.capture(r))
+        measures = (measure for group in GROUPS for measure in group(r))
+        checks += _checks(starmap(r.named, measures), limits)
+        capture = _checks(starmap(r.named, motion.capture(r)))
     manifest = {
         "robot": robot.name,
         "robot_hash": robot.hash,
@@ -89,8 +91,8 @@ def write_audit(folder: str | Path) -> AuditReport:
     tell("audit")
     tape, robot, summary = read_plan(folder)
     task = JumpTask.of(summary["target"])
-    ground = {"edge_m": summary.get("platform_edge_m"), "over": summary.get("over")}
-    report = audit(tape, robot, task, **ground)
+    edge_m = summary.get("platform_edge_m")
+    report = audit(tape, robot, task, edge_m=edge_m, over=summary.get("over"))
     manifest = {**report.manifest, "plan_sha256": sha256(Path(folder, PLAN)), "planner": summary}
     report = dataclasses.replace(report, manifest=manifest)
     with transaction(folder) as staging:

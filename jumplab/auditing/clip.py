@@ -5,9 +5,9 @@ code where that applies.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import compress, pairwise
+from itertools import compress, pairwise, starmap
 from pathlib import Path
 from typing import Any
 
@@ -118,12 +118,11 @@ def judge(
     order : of joints without names, "depth-first" or "breadth-first".
     platform_m : height of a platform on which feet may stand as well [m]; that of a plan is known.
     """
-    known = {} if platform_m is None else {"platform_m": platform_m}
     if isinstance(motion, Clip):
-        return _judged(dataclasses.replace(motion, **known))
+        return _judged(motion, platform_m)
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
     if not isinstance(motion, str | Path):
-        return _judged(dataclasses.replace(Clip.of(motion, robot, fps), **known))
+        return _judged(Clip.of(motion, robot, fps), platform_m)
     path = as_path(motion, "a clip")
     paths = [path]
     if path.is_dir():
@@ -133,11 +132,13 @@ def judge(
                 f"{path}: holds no file that ends in {', '.join(ENDINGS)}; give a folder of clips"
             )
     clips = [clip for one in paths for clip in read_clips(one, robot, fps=fps, order=order)]
-    reports = [_judged(dataclasses.replace(clip, **known)) for clip in clips]
+    reports = [_judged(clip, platform_m) for clip in clips]
     return reports if path.is_dir() or len(reports) > 1 else reports[0]
 
 
-def _judged(clip: Clip) -> ClipReport:
+def _judged(clip: Clip, platform_m: float | None) -> ClipReport:
+    if platform_m is not None:
+        clip = dataclasses.replace(clip, platform_m=platform_m)
     bare = tape_of(clip)
     r = replay(bare, clip.robot, None)
     z = r.sole_points[..., 2].min(axis=2)
@@ -155,13 +156,13 @@ def _judged(clip: Clip) -> ClipReport:
     tape = dataclasses.replace(tape, tau=_of_motors(r))
     r = dataclasses.replace(r, tape=tape)
     falls = _free_falls(r, ground)
+    self_collision, _ = collisions(r)  # how near the body comes to the ground is no fault of it
     measures = [
         *_measures(r, ground, (height, depth, level), falls),
-        *map(_lasting(clip.fps), joints(r)),
-        *collisions(r),
+        *(_lasting(measure, clip.fps) for measure in joints(r)),
+        self_collision,
     ]
-    checks = _checks(measures, ALLOWED)
-    checks = tuple(c for c in checks if c.name != "body clearance")
+    checks = tuple(_checks(starmap(r.named, measures), ALLOWED))
     manifest = {
         "clip": clip.name,
         "format": clip.origin,
@@ -176,11 +177,11 @@ def _judged(clip: Clip) -> ClipReport:
             for t, a, up in falls
         ],
         "versions": versions(),
+        "phases": [list(phase) for phase in phases_of(ground, clip.fps)],
     }
-    fields = {"clip": clip, "tape": tape, "ground": ground, "still": still}
-    report = ClipReport(checks, manifest, **fields, series=_series(r))
-    manifest["phases"] = [list(phase) for phase in report.phases]
-    return report
+    return ClipReport(
+        checks, manifest, clip=clip, tape=tape, ground=ground, still=still, series=_series(r)
+    )
 
 
 def _width(fps: float) -> float:
@@ -318,8 +319,7 @@ def _pushes(r: Replay, k: int, sides: np.ndarray) -> tuple[np.ndarray, np.ndarra
         force = np.tile(edges, (len(corners), 1))
         arms = np.repeat(corners, len(edges), axis=0)
         wrench = np.hstack([force, np.cross(arms - r.foot[k, side], force)]).T
-        frame = r.model.getFrameId(str(r.tape.contact_frames[side]))
-        slope = pin.getFrameJacobian(r.model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+        slope = pin.getFrameJacobian(r.model, data, r.frames[side], pin.LOCAL_WORLD_ALIGNED)
         base = np.vstack([force.T, np.cross(arms - r.com[k], force).T]) / r.weight
         parts.append((wrench, base, (slope.T @ wrench)[6:]))
     wrenches, base, torques = (np.hstack(x) for x in zip(*parts, strict=True))
@@ -335,36 +335,31 @@ def _measures(
     how deep in it, and how high it would stand [m].
     """
     height, depth, level = places
-    t = r.tape.t
-    feet = r.tape.contact_frames
-    standing = _inner(ground, t)
+    standing = _inner(ground, r.tape.t)
     floating = np.where(standing, height, -np.inf)
-    yield "standing feet float", *_most(floating, t, METHOD.float_percent), feet
-    yield "feet in the ground", depth, t, feet
+    yield "standing feet float", _most(floating, METHOD.float_percent)
+    yield "feet in the ground", depth
     near = standing & (height - level < METHOD.near_m)
-    yield "feet on the ground slide", *_most(_sliding(r, near), t, METHOD.slide_percent), feet
+    yield "feet on the ground slide", _most(_sliding(r, near), METHOD.slide_percent)
     deviations = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
     yield "flights fall freely", deviations, [times[0] for times, _, _ in falls]
     missing = norm(r.base_residual[:, :3]) / r.weight
-    yield "unphysical force", *_most(missing, t, METHOD.force_percent)
+    yield "unphysical force", _most(missing, METHOD.force_percent)
     moment = norm(r.base_residual[:, 3:]) / r.weight
-    yield "unphysical moment", *_most(moment, t, METHOD.force_percent)
+    yield "unphysical moment", _most(moment, METHOD.force_percent)
 
 
-def _lasting(fps: float) -> Callable[[Measure], Measure]:
-    """A function that makes torque shares (n, joints) of a measure the least over METHOD.lasting_s
-    around, and leaves other measures alone.
+def _lasting(measure: Measure, fps: float) -> Measure:
+    """A measure with torque shares (n, joints) that are the least over METHOD.lasting_s around;
+    others as they are.
     """
     from scipy.ndimage import minimum_filter1d  # slow to import
 
+    name, values, *more = measure
+    if name not in LASTING:
+        return measure
     size = max(METHOD.lasting_frames, round(METHOD.lasting_s * fps))
-
-    def least(measure: Measure) -> Measure:
-        name, values, *more = measure
-        values = minimum_filter1d(values, size, axis=0) if name in LASTING else values
-        return name, values, *more
-
-    return least
+    return name, minimum_filter1d(values, size, axis=0), *more
 
 
 def _inner(ground: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -384,12 +379,12 @@ def _series(r: Replay) -> dict[str, np.ndarray]:
     }
 
 
-def _most(values: np.ndarray, t: np.ndarray, percent: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values (n, ...) without their largest, beyond a percentile; and their times."""
-    if not np.isfinite(values).any():
-        return values[:0], t[:0]
-    most = np.percentile(values[np.isfinite(values)], percent)
-    return np.where(values <= most, values, -np.inf), t
+def _most(values: np.ndarray, percent: float) -> np.ndarray:
+    """Values (n, ...) without their largest, beyond a percentile; none if none are finite."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return finite
+    return np.where(values <= np.percentile(finite, percent), values, -np.inf)
 
 
 def _sliding(r: Replay, ground: np.ndarray) -> np.ndarray:

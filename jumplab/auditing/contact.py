@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.auditing.replay import Replay, norm
-from jumplab.auditing.report import LIMITS, METHOD, Measure
+from jumplab.auditing.report import METHOD, Measure
 
 OVER = "block"  # that the robot goes over
 
@@ -18,7 +18,6 @@ OVER = "block"  # that the robot goes over
 def places(r: Replay) -> Iterator[Measure]:
     """Places of the soles: slip, turn, heights over ground and platform."""
     t = r.tape.t
-    feet = r.tape.contact_frames
     points = r.sole_points
     slip, turn, hover = np.zeros((3, *r.carrying.shape))
     for k, rows in r.stands:
@@ -34,12 +33,12 @@ def places(r: Replay) -> Iterator[Measure]:
     for rows in r.flights:
         share = (t[rows] - t[rows][0]) / np.ptp(t[rows])
         middle[rows] = (share >= METHOD.mid_flight[0]) & (share <= METHOD.mid_flight[1])
-    yield "toe slip", slip, t, feet
-    yield "foot turn", turn, t, feet
-    yield "toe on the ground", hover, t, feet
-    yield "penetration", -above, t, feet
+    yield "toe slip", slip
+    yield "foot turn", turn
+    yield "toe on the ground", hover
+    yield "penetration", -above
     if middle.any():
-        yield "foot clearance", above[middle], t[middle], feet
+        yield "foot clearance", above[middle], t[middle]
 
 
 def pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
@@ -55,9 +54,6 @@ def pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
 
 def pressure(r: Replay) -> Iterator[Measure]:
     """Pressure under the soles: CoP, friction, and that the ground never pulls."""
-    t = r.tape.t
-    feet = r.tape.contact_frames
-    friction = LIMITS["friction used"].limit
     load = r.tape.f[..., 2]
     loaded = load > r.method.cop_force_n
     cop, torsion = pressure_points(r)
@@ -71,14 +67,15 @@ def pressure(r: Replay) -> Iterator[Measure]:
     outside = np.maximum.reduce([ahead, -ahead - length, aside])
     raised = 1e3 * r.heel_corners[..., 2].min(axis=-1) > r.method.heel_up_mm
     some = loaded.any(axis=1)  # rows with something to check
-    twist = np.abs(torsion) / (friction * r.method.torsion_arm_m * np.where(loaded, load, 1.0))
+    twist = np.abs(torsion) / (
+        METHOD.friction * r.method.torsion_arm_m * np.where(loaded, load, 1.0)
+    )
     used = norm(r.tape.f[..., :2]) / np.maximum(load, r.method.friction_force_n)
-    numbers = vars(r.method) | {"friction": friction}
-    yield "CoP in the sole", np.where(loaded, outside, -np.inf)[some], t[some], feet, numbers
-    yield "CoP at the toe", np.where(loaded & raised, np.abs(ahead), 0.0), t, feet, numbers
-    yield "torsional friction", np.where(loaded, twist, 0.0), t, feet, numbers
-    yield "friction used", used, t, feet, numbers
-    yield "ground only pushes", -load, t, feet
+    yield "CoP in the sole", np.where(loaded, outside, -np.inf)[some], r.tape.t[some]
+    yield "CoP at the toe", np.where(loaded & raised, np.abs(ahead), 0.0)
+    yield "torsional friction", np.where(loaded, twist, 0.0)
+    yield "friction used", used
+    yield "ground only pushes", -load
 
 
 def collisions(r: Replay) -> Iterator[Measure]:
@@ -91,10 +88,7 @@ def collisions(r: Replay) -> Iterator[Measure]:
         for (i, a), (k, b) in combinations(shapes, 2)
         if a != b and parents[a] != b and parents[b] != a
     ]
-    feet = {
-        r.model.frames[r.model.getFrameId(str(n), pin.FrameType.BODY)].parentJoint
-        for n in r.tape.contact_frames
-    }
+    feet = {r.model.frames[k].parentJoint for k in r.frames}
     blocks = [(geometry.addGeometryObject(x), x.name) for x in _surroundings(r)]
     # feet stand on all but what they go over
     outer = [
@@ -114,8 +108,8 @@ def collisions(r: Replay) -> Iterator[Measure]:
     names = [shape.name for shape in geometry.geometryObjects]
     pairs = [f"{names[i]} - {names[k]}" for i, k in inner + outer]
     inside, outside = np.split(np.array(gaps), [len(inner)], axis=1)
-    yield "self-collision", inside, r.tape.t[rows], pairs[: len(inner)]
-    yield "body clearance", outside, r.tape.t[rows], pairs[len(inner) :]
+    yield "self-collision", inside, r.tape.t[rows], None, pairs[: len(inner)]
+    yield "body clearance", outside, r.tape.t[rows], None, pairs[len(inner) :]
 
 
 def _surroundings(r: Replay) -> Iterator[pin.GeometryObject]:

@@ -19,12 +19,11 @@ def _contact_moment(r: Replay) -> np.ndarray:
 
 def forces(r: Replay) -> Iterator[Measure]:
     """Newton and Euler in every sample, and integrated until the last foot leaves."""
-    t = r.tape.t
     # a moment is taken as a share of m g * 1 m
-    yield "base force residual", norm(r.base_residual[:, :3]) / r.weight, t
-    yield "base moment residual", norm(r.base_residual[:, 3:]) / r.weight, t
+    yield "base force residual", norm(r.base_residual[:, :3]) / r.weight
+    yield "base moment residual", norm(r.base_residual[:, 3:]) / r.weight
     missing = np.abs(r.tau - r.tape.tau) / r.model.upperEffortLimit[6:]
-    yield "joint torque consistency", missing, t, r.joints
+    yield "joint torque consistency", missing
     s = slice(0, int(np.flatnonzero(r.ground)[-1]) + 1)  # until the last foot leaves
     # a motion without a flight ends at rest, so its largest momentum is the scale
     last = r.flights[0].start - 1 if r.flights else int(norm(r.com_velocity).argmax())
@@ -32,8 +31,8 @@ def forces(r: Replay) -> Iterator[Measure]:
     gained = r.mass * (r.com_velocity - r.com_velocity[0])
     turned = r.momentum - r.momentum[0] - r.integral(_contact_moment(r))
     scale = max(r.mass * norm(r.com_velocity[last]), 1e-9)
-    yield "linear impulse", norm(gained - r.integral(push))[s] / scale, t[s]
-    yield "angular impulse", norm(turned)[s], t[s]
+    yield "linear impulse", norm(gained - r.integral(push))[s] / scale, r.tape.t[s]
+    yield "angular impulse", norm(turned)[s], r.tape.t[s]
 
 
 def flight(r: Replay) -> Iterator[Measure]:
@@ -52,13 +51,13 @@ def flight(r: Replay) -> Iterator[Measure]:
     if r.flights:
         flown = ~r.ground
         t = r.tape.t[flown]
-        yield "ballistic CoM", apart[flown], t, None, {"g": r.gravity}
+        yield "ballistic CoM", apart[flown], t, {"g": r.gravity}
         yield "gravity in flight", np.abs(np.array(curvatures) / r.gravity - 1)
         yield "angular momentum in flight", spun[flown], t
     # both must vanish
     wrench = norm(r.tape.f[..., :3]) + norm(r.tape.f[..., 3:])
     lifted = np.where(r.carrying, 0.0, wrench)
-    yield "no force in flight", lifted, r.tape.t, r.tape.contact_frames
+    yield "no force in flight", lifted
 
 
 def takeoff(r: Replay) -> Iterator[Measure]:
@@ -83,9 +82,9 @@ def energy(r: Replay) -> Iterator[Measure]:
     push = r.tape.f[r.ground][..., 2].sum(axis=1)
     accelerated = r.com_acceleration[r.ground, 2] + r.gravity
     moved = float(push @ accelerated / max(accelerated @ accelerated, 1e-9))
-    yield "energy balance", np.abs(missing) / span, r.tape.t, None, {"span": span}
+    yield "energy balance", np.abs(missing) / span, None, {"span": span}
     masses = {"moved": moved, "mass": r.mass}
-    yield "mass", abs(moved / r.mass - 1), None, None, masses
+    yield "mass", abs(moved / r.mass - 1), None, masses
 
 
 def available_torque(r: Replay) -> np.ndarray:
@@ -104,26 +103,25 @@ def available_torque(r: Replay) -> np.ndarray:
 
 def joints(r: Replay) -> Iterator[Measure]:
     """Measures of the group "joints": range, speed, torque, torque at speed, torques that hold."""
-    t = r.tape.t
     m = r.model
     angle = r.tape.q[:, 7:]
     torque = np.abs(r.tape.tau)
     beyond = np.maximum(angle - m.upperPositionLimit[7:], m.lowerPositionLimit[7:] - angle)
-    yield "joint range", beyond, t, r.joints
-    yield "joint speed", np.abs(r.tape.v[:, 6:]) / m.upperVelocityLimit[6:], t, r.joints
-    yield "joint torque", torque / m.upperEffortLimit[6:], t, r.joints
-    yield "torque at speed", torque / available_torque(r), t, r.joints
+    yield "joint range", beyond
+    yield "joint speed", np.abs(r.tape.v[:, 6:]) / m.upperVelocityLimit[6:]
+    yield "joint torque", torque / m.upperEffortLimit[6:]
+    yield "torque at speed", torque / available_torque(r)
     bus = r.robot.bus
     if np.isfinite(bus.power_w):
         shaft = r.tape.tau * r.tape.v[:, 6:]
         used = np.where(shaft < 0, bus.regeneration * shaft, shaft) + bus.losses * r.tape.tau**2
-        yield "bus power", used.sum(axis=1) / bus.power_w, t
+        yield "bus power", used.sum(axis=1) / bus.power_w
     if np.isfinite(bus.rms).any():
-        mean = r.integral(r.tape.tau**2)[-1] / (t[-1] - t[0])
-        yield "torque over the motion", np.sqrt(mean[None]) / bus.rms, None, r.joints
+        mean = r.integral(r.tape.tau**2)[-1] / np.ptp(r.tape.t)
+        yield "torque over the motion", np.sqrt(mean[None]) / bus.rms
     if locked := r.robot.locked:
         holding = np.abs(r.holding) / [x.effort for x in locked]
-        yield "torque of locked joints", holding, t, tuple(x.name for x in locked)
+        yield "torque of locked joints", holding, None, None, tuple(x.name for x in locked)
 
 
 def description(r: Replay) -> Iterator[Measure]:
@@ -138,4 +136,4 @@ def description(r: Replay) -> Iterator[Measure]:
         if mass is None or not float(mass.get("value", "0")) > 0
     ]
     yield "sole as in the URDF", np.abs(np.subtract(r.soles, configured_sole(r.robot)))
-    yield "links have mass", len(bare), None, None, {"bare": ", ".join(bare) or "none"}
+    yield "links have mass", len(bare), None, {"bare": ", ".join(bare) or "none"}

@@ -8,23 +8,25 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.replay import Replay, carrying, norm, runs
+from jumplab.auditing.replay import Replay, norm, runs
 from jumplab.auditing.report import METHOD, Measure
-from jumplab.io.tape import Tape
+from jumplab.io.tape import AIR, Tape
 from jumplab.task import JumpTask
+
+DEGREES = np.degrees(1.0)  # a radian
 
 
 def form(tape: Tape) -> Iterator[Measure]:
     """Finite numbers, order of phases and times: without these nothing else can be computed."""
     arrays = (tape.t, tape.q, tape.v, tape.a, tape.tau, tape.f)
     yield "finite numbers", sum((~np.isfinite(x)).sum() for x in arrays)
-    phase = np.asarray(tape.phase)
-    flying = phase == "flight"
+    flying = tape.phase == "flight"
+    carrying = tape.contacts > AIR
     step = np.diff(tape.t)
-    doubled = flying[1:] != flying[:-1]
-    faults = [~flying & (phase != "launch"), flying[:1], carrying(tape).any(axis=1) == flying]
+    doubled = np.diff(flying)
+    faults = [~flying & (tape.phase != "launch"), flying[:1], carrying.any(axis=1) == flying]
     if "contacts" in tape.extra:  # where a foot lands an instant is there twice as well
-        doubled |= (np.diff(carrying(tape).astype(int), axis=0) > 0).any(axis=1)
+        doubled |= (carrying[1:] > carrying[:-1]).any(axis=1)
     else:
         faults.append(abs(doubled.sum() - 1))
     pieces = runs(np.cumsum([False, *doubled]))
@@ -37,7 +39,7 @@ def rates(r: Replay) -> Iterator[Measure]:
     """Positions, rates and accelerations against each other, over a step and over a phase."""
     tape = r.tape
     yield "time step", r.step, tape.t[1:]
-    yield "unit quaternion", np.abs(norm(tape.q[:, 3:7]) - 1), tape.t
+    yield "unit quaternion", np.abs(norm(tape.q[:, 3:7]) - 1)
     v = tape.v
     a = tape.a
     inside = r.step > 0
@@ -57,10 +59,10 @@ def rates(r: Replay) -> Iterator[Measure]:
             q = pin.integrate(r.model, q, mean[i - 1] * r.step[i - 1])
             position[i] = pin.difference(r.model, tape.q[i], q)
         rate[phase] = v[phase.start] + gained[phase] - gained[phase.start] - v[phase]
-    yield "rates against positions", rate_error, t, r.coordinates
-    yield "accelerations against rates", acceleration_error[inside], t, r.coordinates
-    yield "re-integrated positions", np.abs(position), tape.t, r.coordinates
-    yield "re-integrated rates", np.abs(rate), tape.t, r.coordinates
+    yield "rates against positions", rate_error, t
+    yield "accelerations against rates", acceleration_error[inside], t
+    yield "re-integrated positions", np.abs(position)
+    yield "re-integrated rates", np.abs(rate)
 
 
 def switch(r: Replay) -> Iterator[Measure]:
@@ -76,7 +78,7 @@ def switch(r: Replay) -> Iterator[Measure]:
         ("acceleration", tape.a[leaves] - tape.a[leaves - 1], leaves),
     ):
         if len(at):
-            yield f"{kind} at the switch", np.abs(jumps), tape.t[at], r.coordinates
+            yield f"{kind} at the switch", np.abs(jumps), tape.t[at]
 
 
 def mirror(model: pin.Model) -> tuple[np.ndarray, np.ndarray] | None:
@@ -114,24 +116,23 @@ def symmetry(r: Replay) -> Iterator[Measure]:
     forces = [tape.f[..., 1].sum(axis=1), np.ptp(tape.f[..., 2], axis=1)]
     effort = np.column_stack([torque, *np.divide(forces, r.weight)])
     base = ("lateral shift", "roll", "yaw")
-    yield "left/right posture", np.abs(posture), tape.t, (*r.joints, *base)
-    yield "left/right effort", np.abs(effort), tape.t, (*r.joints, "lateral force", "foot load")
+    yield "left/right posture", np.abs(posture), None, None, (*r.joints, *base)
+    yield "left/right effort", np.abs(effort), None, None, (*r.joints, "lateral force", "foot load")
 
 
 def target(r: Replay) -> Iterator[Measure]:
     """Measures of the group "target": touchdown; with a task start, distance, rise, turns."""
     tape = r.tape
     end = tape.t[-1:]
-    feet = tape.contact_frames
     apart = np.abs(r.sole_points[-1:, ..., 2] - r.platform).max(axis=-1)  # (1, K)
-    yield "sole on the surface", apart, end, feet, {"height": r.platform}
+    yield "sole on the surface", apart, end, {"height": r.platform}
     tilt = np.arccos(np.clip(r.foot_rotation[-1:, :, 2, 2], -1, 1))
-    yield "sole flat at touchdown", tilt, end, feet
+    yield "sole flat at touchdown", tilt, end
     names = (*("base",) * 6, *r.joints)
     if r.task or not r.is_jump:
-        yield "start at rest", np.abs(tape.v[:1]), tape.t[:1], names
+        yield "start at rest", np.abs(tape.v[:1]), tape.t[:1], None, names
     if not r.is_jump:
-        yield "end at rest", np.abs(tape.v[-1:]), end, names
+        yield "end at rest", np.abs(tape.v[-1:]), end, None, names
         if r.task and not r.task.standing:
             yield from _flown(r, r.task)
     elif r.task:
@@ -171,32 +172,27 @@ def foot_turn(r: Replay) -> np.ndarray:
 def _place(r: Replay, task: JumpTask) -> Iterator[Measure]:
     """Place and turn of the feet at the end of a jump out of the plane, against the target."""
     end = r.tape.t[-1:]
-    feet = r.tape.contact_frames
     first, last = r.sole_points[[0, -1]].mean(axis=2)  # (K, 3) middles of the soles
     turn = pin.rpy.rpyToMatrix(0.0, 0.0, task.yaw_rad)
     centre = first.mean(axis=0)
     goal = centre + [task.distance_m, task.side_m, 0] + (first - centre) @ turn.T
     ahead, left, _ = (last - first).mean(axis=0)
     numbers = {"ahead": ahead, "left": left, "asked": task.distance_m, "aside": task.side_m}
-    yield "place", norm((last - goal)[None, :, :2]), end, feet, numbers
+    yield "place", norm((last - goal)[None, :, :2]), end, numbers
     side = r.foot_rotation[..., :, 1]  # level in a flip too
     yaw = _turned(-side[..., 0], side[..., 1])
-    yield "heading", np.abs(yaw - task.yaw_rad)[None], end, feet, _degrees(yaw, task.yaw_rad)
+    yield _off("heading", yaw, task.yaw_rad, end, DEGREES)
 
 
 def _asked(r: Replay, task: JumpTask) -> Iterator[Measure]:
-    t = r.tape.t
-    feet = r.tape.contact_frames
     if task.in_plane:
         travel = (r.toe_corners[-1] - r.toe_corners[0]).mean(axis=1)[:, :2]  # (K, 2)
         numbers = {"found": travel[:, 0].mean(), "asked": task.distance_m}
-        yield "distance", norm(travel - [task.distance_m, 0.0])[None], t[-1:], feet, numbers
+        yield "distance", norm(travel - [task.distance_m, 0.0])[None], r.tape.t[-1:], numbers
     else:
         yield from _place(r, task)
     yield from _risen(r, task, slice(r.flights[0].start, None))
-    turn = foot_turn(r)
-    numbers = _degrees(turn, task.rotation_rad)
-    yield "rotation", np.abs(turn - task.rotation_rad)[None], t[-1:], feet, numbers
+    yield _off("rotation", foot_turn(r), task.rotation_rad, r.tape.t[-1:], DEGREES)
 
 
 def _risen(r: Replay, task: JumpTask, flight: slice) -> Iterator[Measure]:
@@ -204,22 +200,23 @@ def _risen(r: Replay, task: JumpTask, flight: slice) -> Iterator[Measure]:
     height = r.com[flight, 2]
     highest = int(np.argmax(height))
     rise = height[highest] - height[0]
-    numbers = {"found": rise, "asked": task.height_m}
-    yield "rise", abs(rise - task.height_m), r.tape.t[flight][highest], None, numbers
+    yield _off("rise", rise, task.height_m, r.tape.t[flight][highest])
 
 
 def _flown(r: Replay, task: JumpTask) -> Iterator[Measure]:
     """Distance and rise of the last flight, after steps or off one foot: ahead of where the feet
     stood first, against those that leave.
     """
-    t = r.tape.t
     row = r.flights[-1].start
     ahead = r.toe_corners[[row, -1], ..., 0].mean(axis=-1) - r.toe_corners[0, ..., 0].mean(axis=-1)
     flown = ahead[1] - ahead[0, r.carrying[row - 1]].mean()
-    numbers = {"found": flown.mean(), "asked": task.distance_m}
-    yield "distance", np.abs(flown - task.distance_m)[None], t[-1:], r.tape.contact_frames, numbers
+    yield _off("distance", flown, task.distance_m, r.tape.t[-1:])
     yield from _risen(r, task, r.flights[-1])
 
 
-def _degrees(turn: np.ndarray, asked: float) -> dict[str, float]:
-    return dict(zip(("found", "asked"), np.degrees([turn.mean(), asked]), strict=True))
+def _off(name: str, found: np.ndarray, asked: float, t: np.ndarray, unit: float = 1.0) -> Measure:
+    """Measure of a number ``found`` at ``t`` [s], () or (K,) of each foot, against the one that was
+    asked for; the note has both, times ``unit``.
+    """
+    numbers = {"found": unit * found.mean(), "asked": unit * asked}
+    return name, np.abs(found - asked)[None], t, numbers

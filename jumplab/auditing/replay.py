@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
-from jumplab.auditing.report import METHOD, of_size
+from jumplab.auditing.report import METHOD, Measure, of_size
 from jumplab.errors import InputError, RobotError
-from jumplab.io.tape import Tape
+from jumplab.io.tape import AIR, Tape
 from jumplab.robot import Robot
 from jumplab.robot.locked import LockedJoint
 from jumplab.robot.motors import SLIDING_RATE
@@ -33,6 +34,11 @@ def runs(values: np.ndarray) -> list[slice]:
     differ = (values[1:] != values[:-1]).reshape(len(values) - 1, -1).any(axis=1)
     edges = [0, *(np.flatnonzero(differ) + 1).tolist(), len(values)]
     return [slice(a, b) for a, b in pairwise(edges)]
+
+
+def spans(flags: np.ndarray) -> list[slice]:
+    """Rows of each run of true flags (N,)."""
+    return [rows for rows in runs(flags) if flags[rows.start]]
 
 
 class Sole(NamedTuple):
@@ -56,6 +62,7 @@ class Replay:
     over: Sequence[float] | None
     model: pin.Model  # built from the URDF alone, as the geometry
     geometry: pin.GeometryModel
+    frames: list[int]  # (K,) of the model, that the feet are
     soles: tuple[Sole, ...]  # one per contact frame
     com: np.ndarray  # (N, 3) [m], its velocity [m/s] and its acceleration [m/s^2]
     com_velocity: np.ndarray
@@ -108,7 +115,7 @@ class Replay:
     @cached_property
     def carrying(self) -> np.ndarray:
         """(N, K) whether a foot is on the ground, as the tape says; what it says is checked."""
-        return carrying(self.tape)
+        return self.tape.contacts > AIR
 
     @cached_property
     def ground(self) -> np.ndarray:
@@ -128,8 +135,7 @@ class Replay:
     @cached_property
     def stands(self) -> list[tuple[int, slice]]:
         """(foot, rows) of each contact."""
-        columns = enumerate(self.carrying.T)
-        return [(k, rows) for k, down in columns for rows in runs(down) if down[rows.start]]
+        return [(k, rows) for k, down in enumerate(self.carrying.T) for rows in spans(down)]
 
     @property
     def is_jump(self) -> bool:
@@ -207,19 +213,30 @@ class Replay:
         beyond = ahead > -1e-9 if self.platform > 0 else ahead > 1e-9
         return np.where(beyond, self.platform, 0.0)
 
+    def named(
+        self,
+        name: str,
+        values: ArrayLike,
+        t: ArrayLike | None = None,
+        numbers: Mapping[str, float | str] | None = None,
+        labels: Sequence[str] | None = None,
+    ) -> Measure:
+        """A measure as :meth:`.Limit.check` takes it: values with N rows are of all samples; (M, K)
+        are of the feet, (M, nv - 6) of the joints and (M, nv) of the coordinates.
+        """
+        x = np.asarray(values, float)
+        if t is None and x.shape[:1] == self.tape.t.shape:
+            t = self.tape.t
+        if labels is None and x.ndim == 2:
+            columns = self.tape.contact_frames, self.joints, self.coordinates
+            labels = {len(names): names for names in columns}.get(x.shape[1])
+        return name, x, t, labels, vars(self.method) | (numbers or {})
+
     def integral(self, values: np.ndarray) -> np.ndarray:
         """Running trapezoid integral over time of (N,) or (N, M) values, zero in the first row."""
         # as scipy does, whose import takes longer than the whole audit
         areas = ((values[1:] + values[:-1]).T * self.step / 2).T
         return np.concatenate([np.zeros_like(values[:1]), np.cumsum(areas, axis=0)])
-
-
-def carrying(tape: Tape) -> np.ndarray:
-    """(N, K) whether a foot is down: by the tape's ``contacts``, else all feet until take-off."""
-    contacts = tape.extra.get("contacts")
-    if isinstance(contacts, np.ndarray) and contacts.shape == tape.f.shape[:2]:
-        return contacts > 0
-    return np.repeat((np.asarray(tape.phase) != "flight")[:, None], tape.f.shape[1], axis=1)
 
 
 def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Model, list[int]]:
@@ -237,9 +254,9 @@ def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Mode
             "the jump again with this robot"
         )
     frames = list(map(str, tape.contact_frames))
-    widths = {"q": model.nq, "v": model.nv, "a": model.nv, "tau": model.nv - 6}
-    needed = {name: (len(tape.t), width) for name, width in widths.items()}
-    for name, shape in (needed | {"f": (len(tape.t), len(frames), 6)}).items():
+    widths = {"q": [model.nq], "v": [model.nv], "a": [model.nv], "tau": [model.nv - 6]}
+    for name, width in {**widths, "f": [len(frames), 6]}.items():
+        shape = (len(tape.t), *width)
         given = getattr(tape, name).shape
         if given != shape:
             raise InputError(
@@ -279,7 +296,8 @@ def replay(
     motion["tau"] += motors.armature * tape.a[:, 6:] + lost
     motion["energy"] += (motors.armature * rates**2).sum(axis=1) / 2
     soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
-    return Replay(tape, robot, task, edge_m, over, model, geometry, soles, lost=lost, **motion)
+    places = tape, robot, task, edge_m, over, model, geometry, frames, soles
+    return Replay(*places, lost=lost, **motion)
 
 
 def configured_sole(robot: Robot) -> Sole:
@@ -335,7 +353,7 @@ def _motion(
             # from the frame's origin in world axes to the joint that carries it
             contact = pin.SE3(np.eye(3), data.oMf[frame].translation).act(pin.Force(wrench))
             joint = model.frames[frame].parentJoint
-            external[joint] = external[joint] + data.oMi[joint].actInv(contact)
+            external[joint] += data.oMi[joint].actInv(contact)
         need = pin.rnea(model, inverse, q, v, a, external)
         about_com = pin.SE3(np.eye(3), data.com[0])
         row = {

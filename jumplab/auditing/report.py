@@ -88,6 +88,7 @@ _GROWS = _TABLE.pop("grows")  # name of a number of METHOD or a limit -> its uni
 LIMITS = {
     name: Limit(group, name, *row) for group, rows in _TABLE.items() for name, row in rows.items()
 }
+METHOD.friction = LIMITS["friction used"].limit
 
 
 def of_size(robot: Robot) -> tuple[SimpleNamespace, dict[str, Limit]]:
@@ -103,7 +104,7 @@ def of_size(robot: Robot) -> tuple[SimpleNamespace, dict[str, Limit]]:
     return SimpleNamespace(**method), limits
 
 
-# what a group of checks yields: the name of a limit, then the arguments of its ``check``
+# what a group of checks yields: the arguments of :meth:`.Replay.named`
 Measure = tuple[Any, ...]
 
 

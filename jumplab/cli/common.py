@@ -64,8 +64,7 @@ def values_of(option: str, text: str) -> list[float]:
         raise InputError(
             f"{option} must be {VALUES} with COUNT from 1 to {MOST_VALUES}, got {text!r}"
         )
-    first = number(option, parts[0])
-    last = number(option, parts[1])
+    first, last = (number(option, part) for part in parts[:2])
     count = int(parts[2])
     return [round(first + (last - first) * k / max(count - 1, 1), 9) for k in range(count)]
 
@@ -104,7 +103,7 @@ def declare(
     """Add a parser for each of these commands, with its options; returns the parsers by name."""
     below = parser.add_subparsers(dest=dest, metavar=dest.upper(), parser_class=type(parser))
     for work in commands:
-        text = work.__doc__ or ""
+        text = work.__doc__
         name = work.__name__.rstrip("_")
         options = dict(OPTIONS[name])
         example = options.pop("example", None)
@@ -176,7 +175,7 @@ def disturbances(option: str, pairs: Sequence[str]) -> dict[str, tuple[float, ..
     """Read options of the form NAME=SIZE or NAME=FROM:TO, given several times: name -> (size,) or
     (from, to).
     """
-    sizes: dict[str, tuple[float, ...]] = {}
+    sizes = {}
     must = f"{option} must be NAME=SIZE or NAME=FROM:TO"
     for pair in pairs:
         name, text = named(must, pair)

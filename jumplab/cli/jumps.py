@@ -27,9 +27,9 @@ def plan(args: Namespace) -> None:
     task = JumpTask(**given(JumpTask, args))
     if args.contacts:
         why = "cannot be used with --contacts, which gives a schedule instead of a target"
-        without(args, why, **{f.name: f.default for f in fields(JumpTask)[2:]})
-        without(args, why, distance_m=1.0, height_m=0.5, like=None)
-        without(args, why, robust=False, atlas=None, starts=1)
+        usual = {f.name: f.default for f in fields(JumpTask)[2:]}
+        usual |= {"distance_m": 1.0, "height_m": 0.5, "like": None}
+        without(args, why, **usual, robust=False, atlas=None, starts=1)
         task = None
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
     ranges = None
@@ -37,9 +37,8 @@ def plan(args: Namespace) -> None:
         ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     else:
         without(args, "has an effect only with --robust, which is not given", disturb=[])
-    options = given(jl.plan, args, task=task, robust=ranges, atlas=atlas)
     with warnings.catch_warnings(action="ignore"):  # the audit is told below
-        plan = jl.plan(**options)
+        plan = jl.plan(**given(jl.plan, args, task=task, robust=ranges, atlas=atlas))
     report = jl.save(args.out, plan)
     args.found |= {"out": args.out, "plan": plan.summary, "audit": _audited(report)}
     print_summary(plan.summary)
@@ -69,7 +68,7 @@ def simulate(args: Namespace) -> None:
     for name, size in sizes.items():
         if len(size) == 1 and sim.is_pair(name):
             sizes[name] = size * 2
-    ranges = sim.ranges_of(sizes)
+    ranges = sim.ranges_of(sizes)  # refuses unknown names
     drawn = None
     if not sizes:
         without(args, "has an effect only with --disturb, which is not given", seed=None)

@@ -9,8 +9,8 @@ from typing import Any
 
 import jumplab as jl
 from jumplab import io
+from jumplab.cli.common import given, print_summary
 from jumplab.cli.common import judge as audited
-from jumplab.cli.common import print_summary
 from jumplab.errors import InfeasibleError
 
 REPORT = "judged.json"
@@ -24,8 +24,7 @@ NEAR = 0.12
 
 def judge(args: Namespace) -> None:
     """Judge motion clips: find motions that no robot could do."""
-    given = {"fps": args.fps, "order": args.order, "platform_m": args.platform_m}
-    result = jl.judge(args.file, args.robot, **given)
+    result = jl.judge(args.file, **given(jl.judge, args))
     reports = result if isinstance(result, list) else [result]
     passed = sum(report.passed for report in reports)
     rows = [report.row() for report in reports]
@@ -79,7 +78,7 @@ def mend(args: Namespace) -> None:
     """Mend a motion clip: plan the nearest motion that the robot can do."""
     from jumplab.auditing import write_audit
 
-    mended = jl.mend(args.file, args.robot, fps=args.fps, order=args.order)
+    mended = jl.mend(args.file, **given(jl.mend, args))
     plan = mended.plan
 
     def complete(folder: Path) -> Any:

@@ -37,9 +37,10 @@ def trials(args: Namespace) -> None:
     options = {"folder": args.dir, "settings": settings_of(args, noise=noise, ranges=ranges)}
     if args.basin:
         report = resumed(paper("basin").landing_basin, args, **options)
-    else:  # 200: a success rate near 95 % is then known to 3 % on either side
-        options |= {"n": args.n or 200, "seed": args.seed or 0}
-        report = resumed(studies.trials.run_trials, args, **options)
+    else:
+        n = args.n or 200  # a success rate near 95 % is then known to 3 % on either side
+        seed = args.seed or 0
+        report = resumed(studies.trials.run_trials, args, n=n, seed=seed, **options)
     data = report.to_json()
     args.found |= data | {"resumed": report.resumed}
     for what, condition in report.conditions.items():
@@ -85,8 +86,13 @@ def chain(args: Namespace) -> None:
     if args.runs > 1:
         options |= {"n": args.runs, "seed": seed, "ranges": ranges, "jobs": args.jobs}
         series = studies.chain.run_chains(**options)
-    where = {"scene": result.scene, "marks_m": course.goals_m}
-    page = jl.plots.page(result.robot, simulation=result, title="A chain of jumps", **where)
+    page = jl.plots.page(
+        result.robot,
+        simulation=result,
+        title="A chain of jumps",
+        scene=result.scene,
+        marks_m=course.goals_m,
+    )
     audits = studies.chain.write_chain(args.out, result, {"chain.html": page.html}, series=series)
     args.found |= {"out": args.out} | result.to_json() | {"series": series}
     _print_chain(result, series)
@@ -148,9 +154,17 @@ def envelope(args: Namespace) -> None:
             args, "holds jumps straight ahead, but this map goes to the side or turns", atlas=None
         )
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
-    options = {"distances": across, "heights": up, "axes": axes, "fixed": fixed}
-    options |= {"folder": args.out, "atlas": atlas}
-    envelope = resumed(studies.envelope.envelope, args, "cells", **options)
+    envelope = resumed(
+        studies.envelope.envelope,
+        args,
+        "cells",
+        distances=across,
+        heights=up,
+        axes=axes,
+        fixed=fixed,
+        folder=args.out,
+        atlas=atlas,
+    )
     figure = jl.plots.envelope_map(envelope)
     args.found["map"] = asdict(envelope) | {"hash": args.robot.hash}
     io.folder.settle()
@@ -215,7 +229,7 @@ def atlas(args: Namespace) -> None:
 
 def choices_of(option: str, pairs: list[str]) -> list[dict[str, float]]:
     """All combinations of what was given as NAME=VALUES, several times."""
-    choices: list[dict[str, float]] = [{}]
+    choices = [{}]
     for pair in pairs:
         name, text = named(f"{option}=A,B,...", pair)
         each = values_of(f"{option.split()[0]} {name}", text)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -112,25 +113,28 @@ class Atlas:
             )
         planner = Planner(robot, **{"keep": True} | arguments)
         atlas = cls(robot.name, distances, heights, {}, key_of_plans(planner.stage("direct")))
-        if folder is not None and (Path(folder) / FILE).exists():
+        path = None if folder is None else Path(folder, FILE)
+        if path and path.exists():
             there = cls.load(folder)
-            path = str(Path(folder) / FILE)
             if there.key != atlas.key:
                 raise InputError(
-                    f"{path!r} holds an atlas of robot {there.robot} that does not fit "
+                    f"{str(path)!r} holds an atlas of robot {there.robot} that does not fit "
                     f"{robot.name}: robot, limits, terms or mesh differ; choose another folder"
                 )
             if (there.distances, there.heights) != (atlas.distances, atlas.heights):
                 raise InputError(
-                    f"{path!r} has another grid of distances and heights; choose another folder"
+                    f"{str(path)!r} has another grid of distances and heights; choose another "
+                    f"folder"
                 )
             return there
 
         grid = [[JumpTask(distance, height) for distance in distances] for height in heights]
-        options = {"jobs": jobs, "progress": progress}
         work = partial(node_row, planner)
         known = "node", atlas.key
-        for task, row in plan_rows(grid, work, known, "planned", folder, "atlas", **options):
+        rows = plan_rows(
+            grid, work, known, "planned", folder, "atlas", jobs=jobs, progress=progress
+        )
+        for task, row in rows:
             if row and row["planned"]:
                 place = task.distance_m, task.height_m
                 atlas.nodes[place] = Node(*place, row["cost"], np.array(row["x"]))
@@ -180,18 +184,17 @@ class Atlas:
         ``body`` as of :meth:`require`, which is called; ``start`` (nq,) is where the robot waits.
         """
         self.require(body)
-        best = None
+        plans = {}  # by their costs
         for node in self.starts(task):
-            try:
-                plan = _from(body, task, node, start)
-            except SolverError:
-                continue
-            cost = plan.solution.statistics.objective
-            if best is None or cost < best.solution.statistics.objective:
-                best = plan
-            if cost <= MIXED * node.cost:
-                break
-        return best
+            phases = unpack(body.program(AHEAD).nlp.assembled, node.x)
+            near = {name: phase.guess() for name, phase in phases.items()}
+            with suppress(SolverError), unexplained():  # the node may not be that close
+                plan = body.plan(task, near=near, stance=start, starts=FROM_NEIGHBOUR[:1])
+                cost = plan.solution.statistics.objective
+                plans.setdefault(cost, plan)
+                if cost <= MIXED * node.cost:
+                    break
+        return plans[min(plans)] if plans else None
 
     @property
     def hash(self) -> str:
@@ -213,11 +216,9 @@ class Atlas:
             "heights": self.heights,
             "nodes": [(n.distance_m, n.height_m, n.cost) for n in nodes],
         }
-        buffer = io.BytesIO()
+        rows = np.array([n.x for n in nodes])
+        np.savez_compressed(buffer := io.BytesIO(), head=json.dumps(head), rows=rows)
         folder = Path(folder)
-        np.savez_compressed(
-            buffer, head=np.array(json.dumps(head)), rows=np.array([n.x for n in nodes])
-        )
         with made(folder), locked(folder):
             return write_file(folder / FILE, buffer.getvalue())
 
@@ -285,15 +286,3 @@ def node_row(planner: Planner, task: JumpTask) -> Plain:
         motion = plan.whole_body.solution.guess(body.mesh.intervals())  # perhaps of a finer mesh
         row["x"] = pack(body.program(AHEAD).nlp.assembled, motion).tolist()
     return row
-
-
-def _from(
-    body: WholeBodyPlanner, task: JumpTask, node: Node, start: np.ndarray | None = None
-) -> WholeBodyPlan:
-    """The plan for a target a few steps from a node; raises :class:`SolverError` if it is not that
-    close.
-    """
-    phases = unpack(body.program(AHEAD).nlp.assembled, node.x)
-    near = {name: phase.guess() for name, phase in phases.items()}
-    with unexplained():
-        return body.plan(task, near=near, stance=start, starts=FROM_NEIGHBOUR[:1])

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 from jumplab.arguments import checked
@@ -92,7 +93,7 @@ class Envelope(Shown):
 
     def _greatest(self, *names: str) -> Cell | None:
         solved = (c for c in self.cells if c.solved)
-        return max(solved, key=lambda c: [getattr(c, name) for name in names], default=None)
+        return max(solved, key=attrgetter(*names), default=None)
 
 
 @checked
@@ -131,9 +132,10 @@ def envelope(
     if atlas is not None:
         atlas.require(planner.stage("direct"))
     known = "direct", robot.hash, atlas and atlas.hash
-    options = {"jobs": jobs, "progress": progress}
     work = partial(cell_row, planner)
-    results = plan_rows(rows, work, known, "clean", folder, "envelope", **options)
+    results = plan_rows(
+        rows, work, known, "clean", folder, "envelope", jobs=jobs, progress=progress
+    )
     cells = tuple(Cell.of(*result) for result in results)
     return Envelope(robot.name, distances, heights, cells, axes)
 

@@ -132,7 +132,7 @@ def plan_rows(
     None. They are kept in ``folder``; ``command`` and ``options`` are those of
     :func:`.study.open_study`.
     """
-    rows: list[list[Plain]] = [[] for _ in tasks]
+    rows = [[] for _ in tasks]
     path = None if folder is None else Path(folder) / CELLS
     with open_study(path, command, total=sum(map(len, tasks)), **options) as study:
         for column in zip(*tasks, strict=True):

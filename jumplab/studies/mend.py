@@ -18,6 +18,7 @@ import pinocchio as pin
 
 from jumplab.arguments import checked
 from jumplab.auditing.clip import ClipReport, judge, phases_of
+from jumplab.control.kinematics import about_vertical
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, require_type
 from jumplab.io.clip import Clip
 from jumplab.io.progress import tell
@@ -66,6 +67,7 @@ FADE_S = 0.2  # in which a leg in the air leaves what holds its foot in place, o
 LEAST_RISE_M = 0.02  # of a clip's flight, to be scaled
 RISE_WEIGHT = 1e5  # [1] / [m/s]^2, of the take-off speed that a target asks for
 FACTORS = (0.8, 0.6, 0.4)  # of what cannot be mended
+POSE = [0, 1, 3]  # x, y and yaw, of charts and of feet
 
 
 @dataclass(frozen=True, repr=False)
@@ -138,7 +140,7 @@ def mend(
         If no motion near it keeps the limits; says which forbid it, and the largest part of the
         clip (in way, turn and height) that can be done.
     """
-    before = _judged(motion, robot, fps, order)
+    before = _judged(motion, robot, fps=fps, order=order)
     planner = Planner(before.clip.robot, keep=True, weights=weights, limits=limits)
     try:
         return _mended(planner, before)
@@ -166,10 +168,7 @@ def mend(
 def like(
     task: JumpTask,
     motion: Any,
-    robot: Robot | str = "bhr",
-    *,
-    fps: float | None = None,
-    order: str = "depth-first",
+    robot: Robot | str | Path = "bhr",
     **changes: Any,
 ) -> JumpPlan:
     """A jump to a target in the manner of a clip: its joints, its feet, its times on the ground.
@@ -177,8 +176,8 @@ def like(
     Parameters
     ----------
     task : travel and rise [m], and turn [rad], on level ground.
-    motion, robot, fps, order, changes : as of :func:`mend`; the clip jumps once, off both feet and
-        down on both.
+    motion, robot : as of :func:`mend`; the clip jumps once, off both feet and down on both.
+    changes : as of :class:`jumplab.Planner`.
 
     Raises
     ------
@@ -190,7 +189,7 @@ def like(
             "a jump like a clip needs level ground and no flip; set platform_m and rotation_rad "
             "to 0"
         )
-    before = _judged(motion, robot, fps, order)
+    before = _judged(motion, robot)
     draft = Draft(before, goal=task)
     return Planner(before.clip.robot, keep=True, **changes).follow(
         draft.contacts,
@@ -202,10 +201,10 @@ def like(
     )
 
 
-def _judged(motion: Any, robot: Robot | str, fps: float | None, order: str) -> ClipReport:
+def _judged(motion: Any, robot: Robot | str | Path, **options: Any) -> ClipReport:
     """The report of one clip, or that which is given."""
     if not isinstance(motion, ClipReport):
-        motion = judge(motion, robot, fps=fps, order=order)
+        motion = judge(motion, robot, **options)
     require_type(motion, ClipReport, "one clip")
     return motion
 
@@ -243,28 +242,30 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             one = ground[max(a - 1, 0)]
             steps = one.sum() == 1 and np.array_equal(one, ground[min(b, len(ground) - 1)])
             ground[a:b] = ~one if steps else False
-    rows = _merged(phases_of(ground, fps))
-    standing = [k for k, row in enumerate(rows) if row[0] == "LR"]
+    feet, times = _merged(phases_of(ground, fps))
+    standing = [k for k, x in enumerate(feet) if x == "LR"]
     if not standing:
         raise InputError(
             f"clip {before.clip.name!r}: it never stands on both feet, and a motion has to begin "
             f"so; give more of it"
         )
     # between long standing the motion that flies longest, else that of most phases
-    long = [k for k in standing[1:-1] if rows[k][2] - rows[k][1] > LONG_S]
+    lasts = np.diff(times)
+    flown = lasts * [x == FLIGHT for x in feet]
+    long = [k for k in standing[1:-1] if lasts[k] > LONG_S]
     ends = pairwise([standing[0], *long, standing[-1]])
-    parts = [rows[a : b + 1] for a, b in ends]
-    rows = max(parts, key=lambda x: (sum(b - a for f, a, b in x if f == FLIGHT), len(x)))
-    if len(rows) > 1:
-        rows[0][1] = max(rows[0][1], rows[0][2] - _standing_s(before, rows[0][2], -1))
-        rows[-1][2] = min(rows[-1][2], rows[-1][1] + _standing_s(before, rows[-1][1], 1))
-    for k in range(len(rows) - 1, 0, -1):
-        feet, a, b = rows[k - 1]
-        if rows[k][0] == FLIGHT:
-            rises = b - min(TOES_S, (b - a) / 2)
-            rows[k - 1][2] = rises
-            rows.insert(k, [feet.lower(), rises, b])
-    return [(feet, a, b) for feet, a, b in rows]
+    first, last = max(ends, key=lambda x: (sum(flown[slice(*x)]), x[1] - x[0]))
+    feet = feet[first : last + 1]
+    times = times[first : last + 2]
+    if last > first:
+        times[0] = max(times[0], times[1] - _standing_s(before, times[1], -1))
+        times[-1] = min(times[-1], times[-2] + _standing_s(before, times[-2], 1))
+    for k in range(len(feet) - 1, 0, -1):
+        if feet[k] == FLIGHT:
+            a, b = times[k - 1 : k + 1]
+            times.insert(k, b - min(TOES_S, (b - a) / 2))
+            feet.insert(k, feet[k - 1].lower())
+    return list(zip(feet, times[:-1], times[1:], strict=True))
 
 
 def _standing_s(before: ClipReport, event_s: float, way: int) -> float:
@@ -274,29 +275,34 @@ def _standing_s(before: ClipReport, event_s: float, way: int) -> float:
     return float(kept[np.argmin(np.interp(event_s + way * kept, before.clip.t, rates) + kept)])
 
 
-def _merged(phases: Sequence[tuple[str, float, float]]) -> list[list]:
-    """Phases without those too short to count, those on one foot first; their time goes to those
-    beside them, but to flights only what is between two of them.
+def _merged(phases: Sequence[tuple[str, float, float]]) -> tuple[list[str], list[float]]:
+    """Feet of n phases, and the n + 1 times [s] at which they begin and end, without those too
+    short to count, those on one foot first; their time goes to those beside them, but to flights
+    only what is between two of them.
     """
-    rows = [list(row) for row in phases]
+    feet = [x for x, _, _ in phases]
+    times = [phases[0][1], *(end for _, _, end in phases)]
     while True:
-        for k in range(len(rows) - 1, 0, -1):
-            if rows[k][0] == rows[k - 1][0]:
-                rows[k - 1][2] = rows.pop(k)[2]
-        short = [k for k, (_, a, b) in enumerate(rows) if b - a < _shortest(rows, k)]
-        if not short or len(rows) == 1:
-            return rows
-        k = min(short, key=lambda k: (rows[k][0] == "LR", rows[k][2] - rows[k][1]))
-        _, a, b = rows.pop(k)
-        if 0 < k < len(rows):
-            flies = [rows[k - 1][0] == FLIGHT, rows[k][0] == FLIGHT]
-            at = (a + b) / 2 if flies[0] == flies[1] else a if flies[0] else b
-            rows[k - 1][2] = rows[k][1] = at
+        for k in range(len(feet) - 1, 0, -1):
+            if feet[k] == feet[k - 1]:
+                del feet[k], times[k]
+        lasts = np.diff(times)
+        short = [k for k, x in enumerate(lasts) if x < _shortest(feet, k)]
+        if not short or len(feet) == 1:
+            return feet, times
+        k = min(short, key=lambda k: (feet[k] == "LR", lasts[k]))
+        del feet[k]
+        if k in (0, len(feet)):
+            del times[0 if k == 0 else -1]
+            continue
+        a, b = times[k : k + 2]
+        before, after = (x == FLIGHT for x in feet[k - 1 : k + 1])
+        times[k : k + 2] = [(a + b) / 2 if before == after else a if before else b]
 
 
-def _shortest(rows: list[list], k: int) -> float:
-    """The least time [s] that phase ``k`` of (feet, from, to) has to last to count."""
-    beside = [row[0] for row in rows[max(k - 1, 0) : k + 2]]
+def _shortest(feet: list[str], k: int) -> float:
+    """The least time [s] that phase ``k`` on these ``feet`` has to last to count."""
+    beside = feet[max(k - 1, 0) : k + 2]
     return SHUFFLED_S if beside in (["LR", "L", "LR"], ["LR", "R", "LR"]) else MERGED_S
 
 
@@ -344,26 +350,24 @@ class Draft:
                 f"needs a clip that flies once, takes off from both feet and lands on both"
             )
         takeoff, landing = (self.middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
-        turn = goal.yaw_rad - (landing[2] - takeoff[2])
-        way = np.add(takeoff[:2], [goal.distance_m, goal.side_m])
-        back = pin.rpy.rpyToMatrix(0.0, 0.0, turn)[:2, :2].T
+        target = np.add(takeoff, [goal.distance_m, goal.side_m, goal.yaw_rad])
+        turn = about_vertical(target[2] - landing[2])
 
-        def there(x: np.ndarray) -> np.ndarray:
-            return (x - landing[:2]) @ back + way
+        def there(poses: np.ndarray) -> np.ndarray:
+            return (poses - landing) @ turn.T + target
 
         _, begin, end = self.phases[k]
-        share = np.clip((self.clip.t - begin) / (end - begin), 0.0, 1.0)[:, None]
+        share = np.clip((self.clip.t - begin) / (end - begin), 0.0, 1.0)
         x = self.charts
-        x[:, :2] += share * (there(x[:, :2]) - x[:, :2])
-        x[:, 3] += share[:, 0] * turn
+        x[:, POSE] += share[:, None] * (there(x[:, POSE]) - x[:, POSE])
         rises_m = [flight["rise_m"] for flight in before.manifest["flights"]]
         line = np.interp(self.clip.t, [begin, end], np.interp([begin, end], self.clip.t, x[:, 2]))
         flown = (share > 0) & (share < 1)
         more = goal.height_m / max([*rises_m, LEAST_RISE_M]) - 1
-        x[:, 2] += flown[:, 0] * more * (x[:, 2] - line)
+        x[:, 2] += flown * more * (x[:, 2] - line)
         for hold in self.holds[k + 1 :]:
-            for side, place in hold.items():
-                hold[side] = np.array([*there(place[:2]), 0.0, place[3] + turn])
+            for place in hold.values():
+                place[POSE] = there(place[POSE])
 
     def middle(self, hold: dict[int, np.ndarray]) -> np.ndarray:
         """x, y of the middle between the soles in their places [m], and their mean yaw [rad]."""
@@ -383,30 +387,29 @@ class Draft:
         middle = np.median((origin + turn @ self.clip.robot.foot.center).mean(axis=1), axis=0)
         ahead = turn[..., 0].mean(axis=(0, 1))
         angle = math.atan2(ahead[1], ahead[0])
-        back = pin.rpy.rpyToMatrix(0.0, 0.0, -angle)[:2, :2]
         out = charts.copy()
-        out[:, :2] = (charts[:, :2] - middle[:2]) @ back.T
-        out[:, 3] -= angle
+        out[:, POSE] = (charts[:, POSE] - [*middle[:2], angle]) @ about_vertical(-angle).T
         out[:, 3] -= 2 * np.pi * np.round(out[first.start, 3] / (2 * np.pi))
         return out
 
     def _holds(self) -> list[dict[int, np.ndarray]]:
         """Of each phase, side -> x, y, z, yaw of the feet that carry: medians over the contact."""
-        holds: list[dict[int, np.ndarray]] = [{} for _ in self.phases]
+        holds = [{} for _ in self.phases]
         for side in (0, 1):
             for first, end in spans([side in modes_of(feet) for feet, _, _ in self.phases]):
                 rows = slice(self._rows(first).start, self._rows(end - 1).stop)
-                x, y, _, yaw = np.median(self.feet[rows, side], axis=0)
+                place = np.median(self.feet[rows, side], axis=0)
                 for hold in holds[first:end]:
-                    hold[side] = np.array([x, y, 0.0, yaw])
+                    hold[side] = place * [1.0, 1.0, 0.0, 1.0]  # on the floor
         return holds
 
     def _contacts(self, factor: float) -> Contacts:
-        first = []
         places = []
         phases = []
-        for k, (feet, a, b) in enumerate(self.phases):
+        held = {}
+        for hold, (feet, a, b) in zip(self.holds, self.phases, strict=True):
             lasts = b - a
+            lands = hold.keys() - held.keys()
             if feet == FLIGHT:
                 kind = FLIGHT
                 lasts *= math.sqrt(factor)
@@ -415,19 +418,16 @@ class Draft:
                 low, high = (lasts * x for x in FLIGHT_STRETCH)
                 high = max(high, SHORT_FLIGHT_S)
             else:
-                lands = k and self.holds[k].keys() - self.holds[k - 1].keys()
-                kind = "toe" if feet.islower() else "landing" if lands else "flat"
+                kind = "toe" if feet.islower() else "landing" if phases and lands else "flat"
                 low, high = (lasts * x for x in STRETCH)
             steps = min(MOST_STEPS, max(LEAST_STEPS, math.ceil(lasts / STEPS_S[kind])))
             phases.append(ContactPhase(feet, (low, high), lasts, steps))
-            for side, hold in self.holds[k].items():
-                if k and side in self.holds[k - 1]:
-                    continue
-                ahead, left = hold[:2] - self.body.places[side][:2]
-                free = ((0.0, 0.0), 0.0) if self.goal or not k else (FREE_M, FREE_RAD)
-                place = Place(float(ahead), float(left), float(hold[3]), 0.0, *free)
-                (places if k else first).append(place)
-        return Contacts(tuple(phases), tuple(places), first=tuple(first))
+            for side in sorted(lands):
+                ahead, left = hold[side][:2] - self.body.places[side][:2]
+                free = ((0.0, 0.0), 0.0) if self.goal or len(places) < 2 else (FREE_M, FREE_RAD)
+                places.append(Place(float(ahead), float(left), float(hold[side][3]), 0.0, *free))
+            held = hold
+        return Contacts(tuple(phases), tuple(places[2:]), first=tuple(places[:2]))
 
     def _along(self) -> Motion:
         """The clip along the schedule, feet that carry in their places; it begins at rest above
@@ -435,40 +435,25 @@ class Draft:
         """
         from scipy.ndimage import gaussian_filter1d  # slow to import
 
-        drawn = [self.sampled(k, p.intervals + 1) for k, p in enumerate(self.contacts.phases)]
-        nodes = [(k, i) for k, rows in enumerate(drawn) for i in range(len(rows))]
-        down = np.array([self._lower(drawn[k][i], k, i) for k, i in nodes])
+        sizes = [p.intervals + 1 for p in self.contacts.phases]
+        nodes = [(k, i) for k, size in enumerate(sizes) for i in range(size)]
+        clip = np.concatenate([self.sampled(k, size) for k, size in enumerate(sizes)])
+        down = np.array([self._lower(x, *node) for x, node in zip(clip, nodes, strict=True)])
+        charts = clip.copy()
         smooth = gaussian_filter1d(np.nan_to_num(down), SMOOTH_FRAMES)
-        missed = 0.0
-        for (k, i), less, least in zip(nodes, smooth, down, strict=True):
-            drawn[k][i, 2] -= np.fmax(less, least)
-            drawn[k][i], left = self._placed(drawn[k][i], k, i)
-            missed = max(missed, left)
-        start = drawn[0][0] = self._start(drawn[0][0])
-        self.start = configurations(self.body.model, start[None])[0]
+        charts[:, 2] -= np.fmax(smooth, down)
+        placed = [self._placed(x, *node) for x, node in zip(charts, nodes, strict=True)]
+        charts = np.array([x for x, _ in placed])
+        charts[0] = self._start(charts[0])
+        self.start = configurations(self.body.model, charts[:1])[0]
         durations = np.array([p.guess_s for p in self.contacts.phases])
-        motion = Motion(durations, drawn, missed)
-        self._fade(motion)
-        return motion
-
-    def _fade(self, motion: Motion) -> None:
-        """Change the charts of a motion over :data:`FADE_S` after feet leave and before they land,
-        so that no leg jumps from the clip's posture to that which has its foot in place.
-        """
-        rows = [(k, i) for k, charts in enumerate(motion.charts) for i in range(len(charts))]
-        ends = pairwise(motion.starts)
-        sizes = map(len, motion.charts)
-        t = np.concatenate([np.linspace(*x, n) for x, n in zip(ends, sizes, strict=True)])
-        moved = np.concatenate([q - self.sampled(k, len(q)) for k, q in enumerate(motion.charts)])
+        ends = np.cumsum(durations)
+        t = np.concatenate([*map(np.linspace, ends - durations, ends, sizes)])
         for side, columns in enumerate(self.body.legs):
-            in_air = [side not in modes_of(self.phases[k][0]) for k, _ in rows]
-            for first, end in spans(in_air):
-                for event in {first - 1, end} - {-1, len(rows)}:
-                    for row in range(first, end):
-                        k, i = rows[row]
-                        left = max(0.0, 1 - abs(t[row] - t[event]) / FADE_S)
-                        share = left**2 * (3 - 2 * left)
-                        motion.charts[k][i, columns] += share * moved[event, columns]
+            in_air = [side not in modes_of(self.phases[k][0]) for k, _ in nodes]
+            charts[:, columns] += faded(charts[:, columns] - clip[:, columns], t, in_air)
+        drawn = np.split(charts, np.cumsum(sizes)[:-1])
+        return Motion(durations, drawn, max(missed for _, missed in placed))
 
     def sampled(self, k: int, count: int) -> np.ndarray:
         """Charts (``count``, 6 + joints) of the clip, evenly over phase ``k``."""
@@ -528,16 +513,28 @@ class Draft:
         modes = modes_of(self.phases[k][0])
         if not modes:
             return chart, 0.0
-        origin, turn = feet_of(self.clip.robot, configurations(self.body.model, chart[None]))
-        goals = [
-            pin.SE3(turn[0, side], origin[0, side] + turn[0, side] @ self.clip.robot.foot.tip)
-            for side in (0, 1)
-        ]
+        data = self.reach.data
+        q = configurations(self.body.model, chart[None])[0]
+        pin.forwardKinematics(self.body.model.model, data, q)
+        goals = [foot.place(data) for foot in self.reach.feet]
         for side, mode in modes.items():
             *place, yaw = self.holds[k][side]
             heel = HEEL_UP * (i / self.contacts.phases[k].intervals) ** 2 * (mode == "toe")
             goals[side] = pin.SE3(pin.rpy.rpyToMatrix(0.0, heel, yaw), np.array(place))
         return self.reach(chart, goals, list(modes))
+
+
+def faded(moved: np.ndarray, t: np.ndarray, in_air: Sequence[bool]) -> np.ndarray:
+    """Changes (n, joints) of a leg ``in_air`` (n,) over :data:`FADE_S` after its foot leaves and
+    before it lands, at times ``t`` (n,) [s], so that it does not jump from the clip's posture to
+    that which has its foot in place, ``moved`` (n, joints) off the clip's.
+    """
+    changes = np.zeros_like(moved)
+    for first, end in spans(in_air):
+        for event in {first - 1, end} - {-1, len(t)}:
+            left = np.maximum(0.0, 1 - np.abs(t[first:end] - t[event]) / FADE_S)
+            changes[first:end] += (left**2 * (3 - 2 * left))[:, None] * moved[event]
+    return changes
 
 
 def _level(charts: np.ndarray, before: ClipReport) -> np.ndarray:
@@ -560,10 +557,8 @@ def _scaled(charts: np.ndarray, first: slice, factor: float) -> np.ndarray:
     """Charts with a ``factor`` of their way, turn and height over where they begin."""
     out = charts.copy()
     start = charts[first].mean(axis=0)
-    for column in (0, 1, 3):
-        out[:, column] = start[column] + factor * (charts[:, column] - start[column])
-    high = np.maximum(charts[:, 2] - start[2], 0.0)
-    out[:, 2] -= (1 - factor) * high
+    out[:, POSE] = start[POSE] + factor * (charts - start)[:, POSE]
+    out[:, 2] -= (1 - factor) * np.maximum(charts[:, 2] - start[2], 0.0)
     return out
 
 
@@ -589,16 +584,12 @@ def _changes(before: ClipReport, draft: Draft, plan: JumpPlan) -> list[dict[str,
         "footholds, largest [m]": max(moved),
     }
     rows = [{"what": name, "change": float(x)} for name, x in changes.items()]
-    flown_s = [b - a for feet, a, b in draft.phases if feet == FLIGHT]
-    pairs = zip(phases, plan.contacts.phases, strict=True)
-    times_s = [x.duration for x, contact in pairs if contact.flying]
+    pairs = zip(draft.phases, phases, strict=True)
+    flown_s = [(b - a, x.duration) for (feet, a, b), x in pairs if feet == FLIGHT]
     com = plan.tape.extra["com"][:, 2]
     rises_m = [flight["rise_m"] for flight in before.manifest["flights"]]
     risen_m = [com[x].max() - com[x.start] for x in plan.tape.flights]
-    both = {
-        "flight {} [s]": zip(flown_s, times_s, strict=True),
-        "rise {} [m]": zip(rises_m, risen_m, strict=False),
-    }
+    both = {"flight {} [s]": flown_s, "rise {} [m]": zip(rises_m, risen_m, strict=False)}
     for what, values in both.items():
         for i, (clip, mended) in enumerate(values, 1):
             row = {"what": what.format(i), "clip": clip, "mended": float(mended)}

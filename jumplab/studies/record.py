@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -295,11 +296,12 @@ class _Search:
             if "takeoff_speed" in self.sought:
                 sizes["height_m"] = max(rise * leg, RANGES["height_m"][1])
             yield replace(self.given, **sizes)
+        largest = partial(max, best, key=itemgetter(0))  # of those that there are by then
         for _ in range(ROUNDS if best and not alone else 0):
-            most, _, _ = max(best, key=itemgetter(0))
+            most, _, _ = largest()
             for share in CLIMB:
-                yield self.at(max(best, key=itemgetter(0))[1], share)
-            if max(best, key=itemgetter(0))[0] <= (1 + SAME) * most:
+                yield self.at(largest()[1], share)
+            if largest()[0] <= (1 + SAME) * most:
                 break
 
     def from_easy(self) -> tuple[dict[str, float], Solved | None]:

@@ -83,13 +83,13 @@ def robust_changes(
     terms = dict(changes.get("terms") or {})
     usual_terms = terms.get(LAST, ())
     axes = (0,) if task.in_plane and robot.planar else (0, 1)
-    capture = capture_term(robot, ranges, axes=axes)
+    capture = capture_term(robot, ranges, axes)
     terms[LAST] = [*([usual_terms] if isinstance(usual_terms, Term) else usual_terms), capture]
     left_out = [*changes.get("off", ()), f"{LAST}/{INSTEAD_OF}"]
     return {**robust, "terms": terms, "off": left_out}
 
 
-def capture_term(robot: Robot, ranges: Ranges, axes: tuple[int, ...] = (0,)) -> Term:
+def capture_term(robot: Robot, ranges: Ranges, axes: tuple[int, ...]) -> Term:
     """The mean square of the distance from the middle of the soles to where sampled robots come to
     rest [m^2].
 

@@ -79,10 +79,10 @@ def grid(
     count = math.prod(map(len, axes))
     if not 1 <= count <= MAX_CASES:
         raise InputError(f"the sweep has {count} cases; it takes 1 to {MAX_CASES}")
-    cases = []
-    for robot, weight, platform, height, distance in product(*axes):
-        task = JumpTask(distance, height, platform)
-        cases.append(Case(task, robot, dict(weight), method))
+    cases = [
+        Case(JumpTask(distance, height, platform), robot, dict(weight), method)
+        for robot, weight, platform, height, distance in product(*axes)
+    ]
     if len({case.key() for case in cases}) < len(cases):
         raise InputError("the sweep has the same case twice; give every value once")
     return cases
@@ -181,17 +181,15 @@ def run(
         raise InputError(f"tapes_hz = {tapes_hz:g} Hz is outside 1 ... 1000 Hz")
     _check_weights(cases)
     folder = ensure_writable(out)
-    places = {}
-    for name in dict.fromkeys(case.robot for case in cases) if atlas else ():
-        places[name] = _atlas(reading.below(folder, "atlas"), cases, name, jobs)
+    robots = dict.fromkeys(case.robot for case in cases if atlas)
+    places = {x: _atlas(reading.below(folder, "atlas"), cases, x, jobs) for x in robots}
     work = {}
     tapes = {}
     for case in cases:
         place = places.get(case.robot)
         name = case.key(tapes_hz, place and place.name)
-        tape = reading.below(folder, TAPES) / f"{name}.npz" if tapes_hz else None
-        work[name] = joblib.delayed(run_case)(case, place, tape, tapes_hz)
-        tapes[name] = tape
+        tapes[name] = tapes_hz and reading.below(folder, TAPES) / f"{name}.npz"
+        work[name] = joblib.delayed(run_case)(case, place, tapes[name], tapes_hz)
     study = open_study(folder / CASES, "sweep", total=len(cases), jobs=jobs, progress=progress)
     with on_cluster(cluster) if cluster else nullcontext(), study as study:
         try:
@@ -213,8 +211,7 @@ def _thinned(tape: Tape, hz: float) -> bytes:
     times = np.arange(0.0, tape.t[-1], 1 / hz)
     rows = np.unique(np.searchsorted(tape.t, times).clip(0, len(tape.t) - 1))
     columns = {n: getattr(tape, n)[rows].astype(np.float32) for n in ("t", "q", "v", "tau")}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, flying=tape.phase[rows] == "flight", **columns)
+    np.savez_compressed(buffer := io.BytesIO(), flying=tape.phase[rows] == "flight", **columns)
     return buffer.getvalue()
 
 

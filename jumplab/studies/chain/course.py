@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.arguments import checked
+from jumplab.control.kinematics import about_vertical
 from jumplab.errors import InputError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.stance import check_stance
@@ -43,7 +43,7 @@ def placed(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Pose after a ``step`` (3,) from a ``pose`` (3,): x, y [m] and heading [rad]; the step is as
     seen from the first pose.
     """
-    return pose + pin.rpy.rpyToMatrix(0.0, 0.0, pose[2]) @ step
+    return pose + about_vertical(pose[2]) @ step
 
 
 def step_of(task: JumpTask) -> np.ndarray:
@@ -53,7 +53,7 @@ def step_of(task: JumpTask) -> np.ndarray:
 
 def seen_from(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
     """The step (3,) that leads from a ``pose`` (3,) to an ``other``."""
-    return pin.rpy.rpyToMatrix(0.0, 0.0, -pose[2]) @ (other - pose)
+    return about_vertical(-pose[2]) @ (other - pose)
 
 
 @dataclass(frozen=True)

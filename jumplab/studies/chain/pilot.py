@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
 from jumplab.control import STAND_S, STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.controller import Controller, Hardware
-from jumplab.control.kinematics import Gauge, State, headed, yaw_of
+from jumplab.control.kinematics import Gauge, Motion, State, about_vertical, headed, yaw_of
 from jumplab.control.landing import LandingController
 from jumplab.control.servo import Drive
 from jumplab.io.tape import Tape
@@ -170,21 +170,20 @@ class ChainPilot:
             return None
         now = self._gauge.motion(headed(q, jump.controller.looks_rad), v)
         left = jump.controller.forecast.time_left(now)
-        return None if left > LOOK_S else (self._at_touchdown(step, q, v, left), True)
+        return None if left > LOOK_S else (self._at_touchdown(step, now, left), True)
 
-    def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
-        """Pose (3,) at the touchdown to come: the posture of the tape, turned as far as the trunk
-        will be off it, on the ballistic CoM.
+    def _at_touchdown(self, step: int, flight: Motion, left: float) -> np.ndarray:
+        """Pose (3,) at the touchdown to come, ``left`` [s] later: the posture of the tape, turned
+        as far as the trunk will be off it, on the ballistic CoM.
         """
-        jump = self.jumps[-1]
-        flight = self._gauge.motion(headed(q, jump.controller.looks_rad), v)
-        turn = jump.controller.forecast.turn_ahead(self._now(step), flight, left)
-        end, _ = jump.controller.forecast.state(flight, turn, left)
+        controller = self.jumps[-1].controller
+        turn = controller.forecast.turn_ahead(self._now(step), flight, left)
+        end, _ = controller.forecast.state(flight, turn, left)
         fall = self._gauge.model.gravity.linear * left**2 / 2
         end[:3] += flight.com + flight.velocity * left + fall - self._gauge.com(end)
         if self._course.in_plane:
             return self._pose(end)
-        pose = self._pose(headed(end, -jump.controller.looks_rad))
+        pose = self._pose(headed(end, -controller.looks_rad))
         pose[2] += yaw_of(turn)
         return pose
 
@@ -271,5 +270,5 @@ def _standing(gauge: Gauge, q: np.ndarray) -> list[pin.SE3]:
     places = []
     for foot, sole in zip(feet, soles - soles.mean(axis=0), strict=True):
         yaw = np.arctan2(foot.rotation[1, 0], foot.rotation[0, 0])
-        places.append(pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), sole))
+        places.append(pin.SE3(about_vertical(yaw), sole))
     return places
