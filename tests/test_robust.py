@@ -117,13 +117,19 @@ def test_a_flip_allows_for_other_robots_by_a_slow_opening(bhr):
     found = robust.robust_changes(flip, bhr, Ranges(), given)
     assert found["off"] == ["jerk"] and "terms" not in found
     assert found["limits"]["opening_speed_share"] == robust.OPENING_SHARE < Limits().of_flip().opening_speed_share
+    assert found["limits"]["torque_share"] == pytest.approx(0.85 * 0.95 / 1.05)  # motors and masses differ by 5 %
     assert settled(Limits, found["limits"], flip=True) == replace(
-        Limits().of_flip(), friction=0.38, body_clearance_m=0.06, opening_speed_share=robust.OPENING_SHARE
+        Limits().of_flip(),
+        friction=0.38,
+        body_clearance_m=0.06,
+        opening_speed_share=robust.OPENING_SHARE,
+        torque_share=found["limits"]["torque_share"],
     )
     own = robust.robust_changes(flip, bhr, Ranges(), {"limits": {"opening_speed_share": 0.5}})
     assert own["limits"]["opening_speed_share"] == 0.5
     jump = robust.robust_changes(TASK, bhr, Ranges(), {})
     assert jump["limits"]["opening_speed_share"] == Limits().opening_speed_share
+    assert jump["limits"]["torque_share"] == Limits().torque_share
 
 
 @pytest.mark.parametrize(

@@ -540,7 +540,7 @@ def test_launches_keep_their_pressure_off_both_ends_of_the_sole(body, name, shar
 
 @pytest.mark.parametrize("turns", [1, -1])
 def test_flips_are_caught_by_their_momentum(body, turns):
-    """Forward by L about the middle of the sole, backward by the capture point ahead of the toes."""
+    """By L about the middle of the sole, within bounds that depend on the direction."""
     limits = Limits().of_flip()
     problem = program(body, "whole body", flip=True)
     given = PLANE | {"rotation": turns * 2 * np.pi}
@@ -557,17 +557,10 @@ def test_flips_are_caught_by_their_momentum(body, turns):
     length = body.leg_m  # of the legs in the stance
     unit = mass * length * np.sqrt(G * length)
     end = of(problem, "flight", "end")
-    toes = x.com - x.tip(0)
-    ahead = toes[0] + about(x.tip(0)) / mass / np.sqrt(G * toes[2])
-    ahead += limits.capture_backward_slope * np.sqrt(length / G) * given["takeoff_speed"]
-    bounds = {"capture by momentum": unit * np.array(limits.capture_forward),
-              "capture beyond the toes": length * np.array(limits.capture_backward)}  # fmt: skip
-    expected = {"capture by momentum": about(x.middle(0)), "capture beyond the toes": ahead}
-    idle = "capture beyond the toes" if turns > 0 else "capture by momentum"
-    expected[idle] = np.mean(bounds[idle])  # a flip of the other direction is not asked
-    check({name: end[name] for name in expected}, expected, p)
-    for name, (low, high) in bounds.items():
-        assert (end[name].lower, end[name].upper) == pytest.approx((low, high))
+    check({"capture by momentum": end["capture by momentum"]}, {"capture by momentum": about(x.middle(0))}, p)
+    asked = limits.capture_forward if turns > 0 else limits.capture_backward
+    bounds = [x(given) for x in (end["capture by momentum"].lower, end["capture by momentum"].upper)]
+    assert bounds == pytest.approx(unit * np.array(asked))
     stroke = {"ankles at touchdown": x.sagittal(x.chart)[2]}
     check({name: end[name] for name in stroke}, stroke, p)
     least = body.robot.sagittal.lower[2] + limits.touchdown_ankle_stroke

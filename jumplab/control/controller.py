@@ -252,7 +252,7 @@ class Controller:
         q, v, _ = state
         now = self._gauge.motion(q, v)
         left = self.forecast.time_left(now)
-        shift = self.forecast.shift(step, now, left) if self._shifts else (0.0, 0.0)
+        shift = self.forecast.shift(step, now, left) if self._shifts else ()
         if left <= LEAD_S and self.ahead.followed is None:
             self._look_ahead(step, now, left)
         aimed = 0.0
@@ -260,6 +260,8 @@ class Controller:
             turn = self.forecast.turn_ahead(step, now, left)
             aimed = self._reaim.correction(now, turn, left)
         command = self.playback.command(step, q, v, aimed, *shift)
+        if self._shifts:
+            command = replace(command, tau=self.forecast.torque(command, q, v))
         return replace(command, share=YIELD_SHARE) if left <= self._yield_s else command
 
     def _decides(self, since: int) -> bool:

@@ -25,7 +25,7 @@ from jumplab.control.kinematics import (
     turned,
     yaw_of,
 )
-from jumplab.control.playback import between
+from jumplab.control.playback import Command, between
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 
@@ -38,6 +38,7 @@ STEEP = 3.97  # slope of the largest shift after its top, times the length of it
 # [1] of the tape's pace that a shift takes at most, once it has grown: it shall not run backwards
 FORWARD = 0.95
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
+PROBE_S = 0.005  # over which the pace of a shifted tape is measured
 NOTHING = 1e-9  # [rad/s] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
 TURNS = 12  # of that about all axes
@@ -75,6 +76,7 @@ class Flight:
     def __init__(self, robot: Robot, tape: Tape, ground: Callable[[float], float]):
         self._gauge = gauge = Gauge(robot)
         self._gravity = robot.gravity
+        self._motors = robot.limits
         self._ground = ground
         self._q = tape.q[-1].copy()
         self._v = tape.v[-1].copy()
@@ -138,9 +140,12 @@ class Flight:
         rates[:3] += attitude.T @ (speed - self._gauge.motion(end, rates).velocity)
         return end, rates
 
-    def shift(self, step: int, now: Motion, left_s: float) -> tuple[float, float]:
-        """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step,
-        ``left_s`` before the touchdown.
+    def shift(self, step: int, now: Motion, left_s: float) -> tuple[float, float, float]:
+        """Time [s] to add to the tape's at ``step``, its rate [1] and how fast that grows [1/s];
+        call it once per step, ``left_s`` before the touchdown.
+
+        Rates are those of the shift as it is: differences from step to step would have the noise
+        of ``left_s``. Where a tuck waits, its pace jumps while the joints are nearly at rest.
         """
         t, left_s = self._clock(step, left_s)
         if left_s > STEP_S:
@@ -152,9 +157,26 @@ class Flight:
             waits = max(want, self._size) <= 0 and t + self._shift <= self.tight_s
             most = np.inf if waits else SHIFT_RATE * STEP_S
             self._size += float(np.clip(want - self._size, -most, most))
-        before = self._shift
         self._shift = float(self.place(self._size, t, t, left_s)) - t
-        return self._shift, (self._shift - before) / STEP_S
+        if left_s <= 0:
+            return self._shift, -1.0, 0.0
+        times = t + min(0.0, left_s - PROBE_S) + PROBE_S * np.arange(-1, 2)
+        before, here, after = self.place(self._size, times, t, left_s)
+        gain = (after - 2 * here + before) / PROBE_S**2 if self._size > 0 else 0.0
+        return self._shift, (after - before) / (2 * PROBE_S) - 1, gain
+
+    def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Torques (nv - 6,) with which a free body, whose base is at ``q`` (nq,) and ``v`` (nv,),
+        makes the commanded motion [N m]; a shifted tape's own are those of another one.
+        """
+        model = self._gauge.model
+        data = self._gauge.data
+        q = np.concatenate([q[:7], command.q])
+        v = np.concatenate([v[:6], command.rate])
+        mass = pin.crba(model, data, q)
+        due = pin.nonLinearEffects(model, data, q, v) + mass[:, 6:] @ command.acceleration
+        base = np.linalg.solve(mass[:6, :6], -due[:6])
+        return due[6:] + mass[6:, :6] @ base + self._motors.lost(command.rate)
 
     def _clock(self, step: int, left_s: float) -> tuple[float, float]:
         """Time [s] at ``step`` and until touchdown; by the tape if the robot will not rise to where

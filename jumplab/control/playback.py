@@ -95,17 +95,19 @@ class Playback:
         correction: np.ndarray | float = 0.0,
         shift_s: float = 0.0,
         pace: float = 0.0,
+        gain: float = 0.0,
     ) -> Command:
         """Command to send at one step, from the measured ``q`` (nq,) and ``v`` (nv,).
 
         ``correction`` (nv - 6,) is added to the angles [rad]. The tape is read ``shift_s`` beyond
-        the step, and ``1 + pace`` times as fast.
+        the step, and ``1 + pace`` times as fast, which grows by ``gain`` [1/s].
         """
         due = step + self.lead + shift_s / STEP_S
         at = min(max(due, 0.0), float(self.steps))
         row = between(self._rows, at)
         angles, rate, tau, change = row[: 4 * self._n].reshape(4, -1)
         acceleration = (1 + pace) ** 2 * (between(self._rate, at + 1.0) - rate) / STEP_S
+        acceleration += gain * rate
         return Command(
             q=angles + correction,
             rate=(1 + pace) * rate if at < self.steps else np.zeros(self._n),

@@ -54,10 +54,11 @@ def robust_changes(
     ``ranges``.
 
     In place of the capture window stands the cost of :func:`capture_term` over sampled robots; a
-    flip keeps its own rows for that, and opens its tuck with :data:`OPENING_SHARE` of the joints'
-    speeds. Friction, torque and speed are used up to the least that ``ranges`` leave. Other
-    differences (delay, motors, ground, shoves, sensors, posture) are not seen: they do not depend
-    on the plan's masses or limits. Own limits win.
+    flip keeps its own rows for that, opens its tuck with :data:`OPENING_SHARE` of the joints'
+    speeds, and leaves the torque that heavier links and weaker motors take. Friction, torque and
+    speed are used up to the least that ``ranges`` leave. Other differences (delay, ground, shoves,
+    sensors, posture; motors of jumps) are not seen: they do not depend on the plan's masses or
+    limits. Own limits win.
 
     Raises :class:`InputError` if ``ranges`` have nothing that a plan can allow for.
     """
@@ -70,13 +71,18 @@ def robust_changes(
     # refuses what is no such thing
     sorted_out(changes.get("terms"), changes.get("weights"), changes.get("off", ()))
     usual = Limits()
-    share = FLIP_FRICTION_SHARE if task.rotation_rad else FRICTION_SHARE
     limits = {
-        "friction": min(usual.friction, share * ranges.friction[0]),
+        "friction": min(usual.friction, FRICTION_SHARE * ranges.friction[0]),
         "torque_share": usual.torque_share * (1 - ranges.torque_loss[1]),
         "speed_share": usual.speed_share * (1 - ranges.speed_loss[1]),
-        "opening_speed_share": OPENING_SHARE if task.rotation_rad else usual.opening_speed_share,
+        "opening_speed_share": usual.opening_speed_share,
     }
+    if task.rotation_rad:
+        # a trunk that its waist cannot hold takes the turn with it
+        heavier = (1 + ranges.mass) / (1 - ranges.motor_gain)
+        limits["friction"] = min(usual.friction, FLIP_FRICTION_SHARE * ranges.friction[0])
+        limits["torque_share"] /= heavier
+        limits["opening_speed_share"] = OPENING_SHARE
     robust = {**changes, "limits": limits | named(Limits, changes.get("limits"))}
     if task.rotation_rad:
         return robust

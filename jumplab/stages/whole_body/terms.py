@@ -21,7 +21,6 @@ from jumplab.stages.whole_body.legs import independent, off_foothold
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.settings import LATE_SHARE, RESERVE_SHARE
 from jumplab.stages.whole_body.shapes import Apart
-from jumplab.task import GRAVITY
 
 MOMENT_ARM_M = 0.2  # nominal size of moments over that of forces
 # [kg m^2/s], [m/s^2, rad/s^2] for conditioning
@@ -651,7 +650,7 @@ def capture_rows(m: Mode) -> list[Term]:
     """
     lim = m.limits
     if lim.capture_moment is not None:
-        return flip_capture_in_plane(m) if m.free.plane else [flip_capture(m)]
+        return [flip_capture(m)]
 
     def capture(p):
         ahead = p.turned([lim.capture_offset_m, 0.0, 0.0])
@@ -669,43 +668,22 @@ def about(m: Mode, p: Instant, place: ca.SX) -> ca.SX:
 
 
 def flip_capture(m: Mode) -> Term:
-    """L about the middle of the soles, which the impact does not change."""
-    most = m.limits.capture_moment * m.body.spin_size
+    """L about the middle of the soles, which the impact does not change; in the plane within what
+    most flips of that direction are caught with.
+    """
+    lim = m.limits
+    size = m.body.spin_size
     level = [k for k in m.free.spins if k < 2]
 
     def momentum(p):
         return about(m, p, p.sole_middle)[level]
 
+    def bound(side):
+        def measured(parameters):
+            forward = float(parameters["rotation"]) > 0
+            return size * (lim.capture_forward if forward else lim.capture_backward)[side]
+
+        return measured if m.free.plane else (-1, 1)[side] * lim.capture_moment * size
+
     words = "capture by momentum", f"ours, for flips; {CAPTURE}", "kg m^2/s", "end"
-    return limit(*words, momentum, -most, most, scale=SPIN_SCALE)
-
-
-def flip_capture_in_plane(m: Mode) -> list[Term]:
-    """A flip forward asks for its angular momentum about the soles, which the impact does not
-    change; a flip backward for its capture point, x + v_x / sqrt(g / z), ahead of the toes."""
-    lim = m.limits
-    body = m.body
-    slope_s = lim.capture_backward_slope * float(np.sqrt(body.leg_m / GRAVITY))
-
-    def forward(p):
-        return about(m, p, p.sole_middle)[1]
-
-    def backward(p):
-        toe = p.point("left_toe")
-        arm = p.com - toe
-        # far from a landing the CoM of a start may be below the toes
-        pace = m.model.mass * ca.sqrt(p.p.gravity * ca.fmax(arm[2], body.leg_m / 2))
-        return arm[0] + about(m, p, toe)[1] / pace + slope_s * p.p.takeoff_speed
-
-    def one_way(sign, of, bounds):
-        # in flips of the other direction the row is a constant inside its bounds
-        return lambda p: ca.if_else(sign * p.p.rotation > 0, of(p), sum(bounds) / 2)
-
-    ahead = [x * body.spin_size for x in lim.capture_forward]
-    back = [x * body.leg_m for x in lim.capture_backward]
-    momentum = "capture by momentum", f"ours, for flips forward; {CAPTURE}", "kg m^2/s", "end"
-    beyond = "capture beyond the toes", f"ours, for flips backward; {CAPTURE}", "m", "end"
-    return [
-        limit(*momentum, one_way(1, forward, ahead), *ahead, scale=SPIN_SCALE),
-        limit(*beyond, one_way(-1, backward, back), *back, scale=PLACE_SCALE),
-    ]
+    return limit(*words, momentum, bound(0), bound(1), scale=SPIN_SCALE)
