@@ -22,10 +22,11 @@ import numpy as np
 
 from jumplab import api
 from jumplab.auditing import AuditReport
+from jumplab.control.kinematics import pitch_of
 from jumplab.errors import JumplabError
 from jumplab.robot import Robot
 from jumplab.show.tables import Table, table
-from jumplab.sim import INSTALLED, Scene
+from jumplab.sim import INSTALLED, Ranges, Scene
 from jumplab.stages.planner import Planner
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trial
 from jumplab.task import JumpTask
@@ -40,7 +41,7 @@ FAR = 3.0  # times the rise, the farthest that is asked: shallower jumps slip
 PERTURBED = 100  # robots, of each flip in :data:`THROWN`
 MANY = 250  # of kind "perturbed"
 # lower ones leave robots that differ from their model little time to turn over
-THROWN = ("backflip, 0 m ahead, 0.5 m up", "front flip, 0.1 m ahead, 0.5 m up")
+THROWN = ("backflip, robust plan, 0 m ahead, 0.5 m up", "front flip, 0.1 m ahead, 0.5 m up")
 COLUMNS = {
     "kind": "kind",
     "asked": "targets",
@@ -53,14 +54,16 @@ COLUMNS = {
 }
 
 
-def targets() -> dict[str, list[dict[str, float]]]:
-    """Kind -> fields of :class:`.JumpTask`; where motors are weaker, also factors ``effort`` and ``speed``."""
+def targets() -> dict[str, list[dict[str, Any]]]:
+    """Kind -> fields of :class:`.JumpTask`; where motors are weaker, also factors ``effort`` and ``speed``, and
+    ``robust`` of a plan that allows for other robots.
+    """
     rng = np.random.default_rng(SEED)
 
     def drawn(low: float, high: float) -> float:
         return round(float(rng.uniform(low, high)), 2)
 
-    asked: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
+    asked: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
     for kind, number in zip(KINDS, TARGETS, strict=False):
         for k in range(number):
             rise = drawn(0.1, 0.35)  # onto a platform that high, at most 0.3 m, by 0.15 m more
@@ -79,6 +82,8 @@ def targets() -> dict[str, list[dict[str, float]]]:
             }
             asked[kind].append(found[kind])
     asked["perturbed"].append({"distance_m": 0.4, "height_m": 0.2})
+    backflip = {"rotation_rad": -2 * math.pi, "distance_m": 0.0, "height_m": 0.5}
+    asked["flip"].append(backflip | {"robust": True})
     for turns, far in ((-1, 0.0), (1, 0.1)):
         over = {"rotation_rad": turns * 2 * math.pi, "distance_m": far}
         asked["flip"] += [over | {"height_m": rise} for rise in (0.3, 0.35, 0.4, 0.45, 0.5)]
@@ -90,7 +95,7 @@ def targets() -> dict[str, list[dict[str, float]]]:
     return asked
 
 
-def key(kind: str, target: dict[str, float]) -> str:
+def key(kind: str, target: dict[str, Any]) -> str:
     """The name of a row in the log."""
     return f"{kind}: " + json.dumps(target, sort_keys=True)
 
@@ -102,15 +107,17 @@ def planner(effort: float, speed: float) -> Planner:
     return Planner(robot if effort == speed == 1 else robot.with_limits(effort=effort, speed=speed), keep=True)
 
 
-def attempt(kind: str, target: dict[str, float]) -> dict[str, Any]:
+def attempt(kind: str, target: dict[str, Any]) -> dict[str, Any]:
     """One row: the plan, its audit, and, where that is clean, its simulations and those of robots that differ."""
     task = dict(target)
     factors = task.pop("effort", 1.0), task.pop("speed", 1.0)
+    allows = Ranges() if task.pop("robust", False) else None
     row: dict[str, Any] = {"kind": kind, **target, "effort": factors[0], "speed": factors[1]}
     row |= {"planned": False, "clean": False, "said": ""}
     start = time.process_time()
     try:
-        plan = planner(*factors).plan(JumpTask(**task))
+        jump = JumpTask(**task)
+        plan = api.plan(jump, ROBOT, robust=allows) if allows else planner(*factors).plan(jump)
     except JumplabError as e:
         return row | {"said": str(e), "cpu_s": round(time.process_time() - start, 2)}
     attempts = plan.whole_body.attempts
@@ -141,11 +148,13 @@ def landing(plan: Any, engine: str) -> list[Any]:
 
 
 def thrown(plan: Any, engine: str, count: int) -> list[bool]:
-    """Of ``count`` robots that differ from their model, whether each one lands."""
+    """Of ``count`` robots that differ from their model, whether each one lands, turned over where the plan is."""
     settings = TrialSettings(engine=engine)
     there = SimpleNamespace(tape=plan.tape, robot=plan.robot, scene=Scene.flat())
     keys = (TrialKey(0, k, settings.hash, "") for k in range(count))
-    return [run_trial(there, settings, k).landed for k in keys]
+    trials = [run_trial(there, settings, k) for k in keys]
+    turned = float(np.unwrap(pitch_of(plan.tape.q))[-1])
+    return [t.landed and abs(t.metrics.touchdown_trunk_pitch_rad - turned) < math.pi / 2 for t in trials]
 
 
 # what the log says
@@ -198,6 +207,7 @@ def flips(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def named(row: dict[str, Any]) -> str:
     """A flip in words."""
     turn = "front flip" if row["rotation_rad"] > 0 else "backflip"
+    turn += ", robust plan" if row.get("robust") else ""
     return f"{turn}, {row['distance_m']:g} m ahead, {row['height_m']:g} m up"
 
 

@@ -73,10 +73,9 @@ class Limits:
     # if set, not the window but L about the soles' middle, either way, in shares of m l sqrt(g l),
     # l the leg's length
     capture_moment: float | None = None
-    # in the plane instead, of flips forward and backward (measured: with which most robots unlike
-    # their model stand; backward of the G1, as many as with 0.01 to 0.06 of bhr)
+    # of robots that move in the plane alone instead, for flips forward and backward (measured)
     capture_forward: tuple[float, float] = (0.070, 0.116)
-    capture_backward: tuple[float, float] = (-0.02, 0.01)
+    capture_backward: tuple[float, float] = (0.045, 0.065)
     # of the speed limit, in the last :data:`LATE_SHARE` of the flight, if it is less
     opening_speed_share: float = 1.0
     # where left and right move differently
@@ -135,7 +134,8 @@ class Limits:
             touchdown_waist_rad=0.5,  # it opens with the legs
             # an ankle at its stop cannot keep a tilted robot's soles flat
             touchdown_ankle_stroke=0.12,
-            capture_moment=0.047,
+            # G1s unlike their model stand with 0.05 less, and with 0.05 more
+            capture_moment=0.02,
         )
 
 

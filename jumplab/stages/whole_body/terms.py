@@ -668,22 +668,24 @@ def about(m: Mode, p: Instant, place: ca.SX) -> ca.SX:
 
 
 def flip_capture(m: Mode) -> Term:
-    """L about the middle of the soles, which the impact does not change; in the plane within what
-    most flips of that direction are caught with.
+    """L about the middle of the soles, which the impact does not change; of robots that move in the
+    plane alone within what most flips of that direction are caught with.
     """
     lim = m.limits
     size = m.body.spin_size
     level = [k for k in m.free.spins if k < 2]
+    most = np.full(len(level), lim.capture_moment * size)
 
     def momentum(p):
         return about(m, p, p.sole_middle)[level]
 
-    def bound(side):
-        def measured(parameters):
+    def measured(side):
+        def bound(parameters):
             forward = float(parameters["rotation"]) > 0
             return size * (lim.capture_forward if forward else lim.capture_backward)[side]
 
-        return measured if m.free.plane else (-1, 1)[side] * lim.capture_moment * size
+        return bound
 
+    bounds = (measured(0), measured(1)) if m.robot.planar else (-most, most)
     words = "capture by momentum", f"ours, for flips; {CAPTURE}", "kg m^2/s", "end"
-    return limit(*words, momentum, bound(0), bound(1), scale=SPIN_SCALE)
+    return limit(*words, momentum, *bounds, scale=SPIN_SCALE)
