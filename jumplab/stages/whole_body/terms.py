@@ -686,6 +686,7 @@ def flip_capture(m: Mode) -> Term:
 
         return bound
 
-    bounds = (measured(0), measured(1)) if m.robot.planar else (-most, most)
+    usual = m.free.plane and m.robot.planar
+    bounds = (measured(0), measured(1)) if usual else (-most, most)
     words = "capture by momentum", f"ours, for flips; {CAPTURE}", "kg m^2/s", "end"
     return limit(*words, momentum, *bounds, scale=SPIN_SCALE)
