@@ -91,7 +91,8 @@ def table() -> str:
     flips = [*lines(srmp.build_problem(robot, SrmpSettings().of_flip()), rod)]
     for name in PROGRAMS:
         free = coordinates.whole(body) if name == "spatial" else coordinates.even(body)
-        given = {"stance": free.taken(body.stance), "yaw": 2 * np.pi, "takeoff_speed": TARGET.takeoff_speed}
+        given = {"stance": free.taken(body.stance), "yaw": 2 * np.pi, "rotation": -2 * np.pi}
+        given["takeoff_speed"] = TARGET.takeoff_speed
         found += lines(program(body, name), given)
         flips += lines(program(body, name, flip=True), given)
         if name == "spatial":
