@@ -135,7 +135,7 @@ class Limits:
             # an ankle at its stop cannot keep a tilted robot's soles flat
             touchdown_ankle_stroke=0.12,
             # G1s unlike their model stand with 0.05 less, and with 0.05 more
-            capture_moment=0.02,
+            capture_moment=0.01,
         )
 
 
