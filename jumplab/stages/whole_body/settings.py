@@ -134,7 +134,6 @@ class Limits:
             touchdown_waist_rad=0.5,  # it opens with the legs
             # an ankle at its stop cannot keep a tilted robot's soles flat
             touchdown_ankle_stroke=0.12,
-            # G1s unlike their model stand with 0.05 less, and with 0.05 more
             capture_moment=0.01,
         )
 
