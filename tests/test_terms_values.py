@@ -558,7 +558,7 @@ def test_flips_are_caught_by_their_momentum(body, turns):
     unit = mass * length * np.sqrt(G * length)
     end = of(problem, "flight", "end")
     check({"capture by momentum": end["capture by momentum"]}, {"capture by momentum": about(x.middle(0))}, p)
-    asked = limits.capture_forward if turns > 0 else limits.capture_backward
+    asked = limits.capture_in_plane[2:] if turns > 0 else limits.capture_in_plane[:2]
     bounds = [x(given) for x in (end["capture by momentum"].lower, end["capture by momentum"].upper)]
     assert bounds == pytest.approx(unit * np.array(asked))
     stroke = {"ankles at touchdown": x.sagittal(x.chart)[2]}

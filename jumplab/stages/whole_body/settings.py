@@ -73,9 +73,10 @@ class Limits:
     # if set, not the window but L about the soles' middle, either way, in shares of m l sqrt(g l),
     # l the leg's length
     capture_moment: float | None = None
-    # of robots that move in the plane alone instead, for flips forward and backward (measured)
-    capture_forward: tuple[float, float] = (0.070, 0.116)
-    capture_backward: tuple[float, float] = (0.045, 0.065)
+    # in the plane instead, least and most of flips backward, then forward (measured: with which
+    # most robots unlike their model stand); of robots that move in the plane alone, and of others
+    capture_in_plane: tuple[float, float, float, float] = (0.045, 0.065, 0.070, 0.116)
+    capture_even: tuple[float, float, float, float] = (0.0, 0.02, 0.04, 0.08)
     # of the speed limit, in the last :data:`LATE_SHARE` of the flight, if it is less
     opening_speed_share: float = 1.0
     # where left and right move differently
@@ -134,7 +135,7 @@ class Limits:
             touchdown_waist_rad=0.5,  # it opens with the legs
             # an ankle at its stop cannot keep a tilted robot's soles flat
             touchdown_ankle_stroke=0.12,
-            capture_moment=0.01,
+            capture_moment=0.047,
         )
 
 

@@ -668,25 +668,25 @@ def about(m: Mode, p: Instant, place: ca.SX) -> ca.SX:
 
 
 def flip_capture(m: Mode) -> Term:
-    """L about the middle of the soles, which the impact does not change; of robots that move in the
-    plane alone within what most flips of that direction are caught with.
+    """L about the middle of the soles, which the impact does not change; in the plane within what
+    most flips of that direction are caught with.
     """
     lim = m.limits
     size = m.body.spin_size
     level = [k for k in m.free.spins if k < 2]
     most = np.full(len(level), lim.capture_moment * size)
+    windows = lim.capture_in_plane if m.robot.planar else lim.capture_even
 
     def momentum(p):
         return about(m, p, p.sole_middle)[level]
 
     def measured(side):
         def bound(parameters):
-            forward = float(parameters["rotation"]) > 0
-            return size * (lim.capture_forward if forward else lim.capture_backward)[side]
+            backward, forward = windows[:2], windows[2:]
+            return size * (forward if float(parameters["rotation"]) > 0 else backward)[side]
 
         return bound
 
-    usual = m.free.plane and m.robot.planar
-    bounds = (measured(0), measured(1)) if usual else (-most, most)
+    bounds = (measured(0), measured(1)) if m.free.plane else (-most, most)
     words = "capture by momentum", f"ours, for flips; {CAPTURE}", "kg m^2/s", "end"
     return limit(*words, momentum, *bounds, scale=SPIN_SCALE)
