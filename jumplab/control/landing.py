@@ -142,9 +142,8 @@ class LandingController:
         self._effort_rows = np.vstack([body.unknowns, left - right])
         weights = (g.acceleration_weight, g.wrench_weight, g.uneven_weight)
         self._effort_weight = np.repeat(weights, [body.nv, 12, 6])
-        self._anchors: Sequence[Anchor] | None = (
-            None  # where wrenches act, if not at the soles' middles
-        )
+        # where wrenches act, if not at the soles' middles
+        self._anchors: Sequence[Anchor] | None = None
         rest = stance_configuration(robot)
         # posture to go to, and its rates and accelerations
         self._rest = rest[7:]

@@ -252,7 +252,7 @@ ROUGH = {
 }
 # of a schedule, whose feet are in place and whose links meet long before its cost has settled
 DRAWN = replace(COLD[0], patience=100, options=QUICK | ROUGH)
-# one that leads somewhere has mostly done so after 40 steps; a step off by 0.1 m takes 60
+# one that leads somewhere has mostly done so after 40 steps; a step off by 0.1 m takes 54
 ALONG = (replace(DRAWN, patience=80), *COLD[1:])
 # where links meet, more of its rows are left to the second solve: from 3e-2 to 1e-2 the barrier of
 # the first one may wander for ten steps
