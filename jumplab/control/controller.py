@@ -255,7 +255,7 @@ class Controller:
         shift = self.forecast.shift(step, now, left) if self._shifts else ()
         if left <= LEAD_S and self.ahead.followed is None:
             self._look_ahead(step, now, left)
-        aimed = 0.0
+        aimed = 0.0, 0.0, 0.0
         if self._reaim is not None:
             turn = self.forecast.turn_ahead(step, now, left)
             aimed = self._reaim.correction(now, turn, left)
@@ -297,7 +297,9 @@ def _hindrance(tape: Tape, gauge: Gauge, flies: bool) -> str | None:
     """Reason for which stage 1's landing cannot be followed; None if it can be."""
     if not flies:
         return "a robot that stands on one foot does not fall onto the other"
-    headings = np.unwrap([gauge.heading(q) for q in tape.q[tape.flights[-1]]])
+    headings = [gauge.heading(q) for q in tape.q[tape.flights[-1]]]
+    if not is_flip(tape):  # upside down, feet point backwards
+        headings = np.unwrap(headings)
     turned = abs(headings[-1] - headings[0])
     if turned < TURNS_RAD:
         return None

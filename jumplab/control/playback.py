@@ -4,6 +4,7 @@ what joints are sent. The paper plays it in position mode (Sec. VI-B).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,15 +93,16 @@ class Playback:
         step: int,
         q: np.ndarray,
         v: np.ndarray,
-        correction: np.ndarray | float = 0.0,
+        correction: Sequence[np.ndarray | float] = (0.0, 0.0, 0.0),
         shift_s: float = 0.0,
         pace: float = 0.0,
         gain: float = 0.0,
     ) -> Command:
         """Command to send at one step, from the measured ``q`` (nq,) and ``v`` (nv,).
 
-        ``correction`` (nv - 6,) is added to the angles [rad]. The tape is read ``shift_s`` beyond
-        the step, and ``1 + pace`` times as fast, which grows by ``gain`` [1/s].
+        ``correction`` (3, nv - 6) is added to angles, rates and accelerations [rad, rad/s,
+        rad/s^2]. The tape is read ``shift_s`` beyond the step, and ``1 + pace`` times as fast,
+        which grows by ``gain`` [1/s].
         """
         due = step + self.lead + shift_s / STEP_S
         at = min(max(due, 0.0), float(self.steps))
@@ -109,9 +111,9 @@ class Playback:
         acceleration = (1 + pace) ** 2 * (between(self._rate, at + 1.0) - rate) / STEP_S
         acceleration += gain * rate
         return Command(
-            q=angles + correction,
-            rate=(1 + pace) * rate if at < self.steps else np.zeros(self._n),
-            acceleration=acceleration,
+            q=angles + correction[0],
+            rate=((1 + pace) * rate if at < self.steps else np.zeros(self._n)) + correction[1],
+            acceleration=acceleration + correction[2],
             tau=tau,
             change=change,
             feet=self.stands(at),

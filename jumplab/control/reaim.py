@@ -20,13 +20,11 @@ from jumplab.robot.legs import leg_columns, size
 from jumplab.robot.stance import knees
 
 START_S = 0.12  # before touchdown; earlier, the correction fights the swing itself
-# [rad/s] 0.8 rad within the last 0.2 m at 3 m/s, two thirds of the speed limit of the hip
-RATE = 12.0
+# [s] a correction aims at a touchdown that is at least so far ahead, or noise would shake the legs
+LEAST_S = 0.04
 LARGEST_RAD = 0.8  # beyond 45 degrees the planned landing posture is lost anyway
 FASTEST_FALL = 1.0  # [m/s] below it the foothold says little about the moment
-# [s], [rad/s] yaw and roll joints swing nothing, and move legs that are heavy
-SIDE_START_S = 0.20
-SIDE_RATE = 8.0
+SIDE_START_S = 0.20  # yaw and roll joints swing nothing, and move legs that are heavy
 NEWTON_STEPS = 3  # twelve equations, nearly linear
 # of a sole's miss: forward, sideways, up [1/m], turned about these axes [1/rad]; a sole off the
 # level tips, a leg can hardly go inwards, and no landing hangs on where a foot points
@@ -80,7 +78,7 @@ class Reaim:
         self._pitching = np.isin(names, [name for name, _, _ in robot.role_signs()])
         self._is_arm = np.isin(names, robot.joints["shoulder_pitch"])
         self._start_s = large.of(np.where(self._pitching, START_S, SIDE_START_S), "s")
-        self._most = STEP_S * large.of(np.where(self._pitching, RATE, SIDE_RATE), "rad/s")
+        self._least_s = large.of(LEAST_S, "s")
         self._limbs = np.concatenate([self._legs, np.flatnonzero(self._is_arm)])
         self._low, self._high = self._range(robot)
         self._far = False
@@ -91,7 +89,7 @@ class Reaim:
         self._middle = self._places.mean(axis=0)
         tipping = end.momentum / robot.total_mass - np.cross(self._middle, end.velocity)
         self._tipping = tipping[:2]
-        self._now = np.zeros(len(names))
+        self._now, self._rate = np.zeros((2, len(names)))
 
     def _range(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Least and largest angles (nv - 6,) of the joints at touchdown; as planned is allowed."""
@@ -108,21 +106,24 @@ class Reaim:
         )
 
     def correction(self, now: Motion, turn: np.ndarray, left_s: float) -> np.ndarray:
-        """Angles (nv - 6,) to add to the tape [rad]; call it once per step, it moves at
-        :data:`RATE` at most.
+        """Angles, rates and accelerations (3, nv - 6) to add to the tape's; call it once per step.
 
         ``turn`` (3, 3) is the trunk's attitude at touchdown, in ``left_s``, times that of the plan
-        transposed.
+        transposed. The correction comes to rest at what :meth:`touchdown` asks for, by the cubic
+        way that is left: drives that are sent angles alone lag behind by some centimetres of sole.
         """
         tilt = pin.log3(turn)[:2]
         ahead = tilt[1] > 0 and np.abs(tilt).max() > FAR_RAD
         self._far |= bool(ahead and not self._legs_alone)
         moving = (left_s < self._start_s) | (self._is_arm & self._far)
+        gained = np.zeros(len(moving))
         if np.any(moving):
-            step = self.touchdown(now, turn, left_s)[0] - self._now
-            step = np.clip(step, -self._most, self._most)
-            self._now = self._now + np.where(moving, step, 0.0)
-        return self._now
+            way = self.touchdown(now, turn, left_s)[0] - self._now
+            lasts_s = max(left_s, self._least_s)
+            gained = np.where(moving, 6 * way / lasts_s**2 - 4 * self._rate / lasts_s, 0.0)
+            self._rate = self._rate + STEP_S * gained
+            self._now = self._now + STEP_S * self._rate
+        return np.stack([self._now, self._rate, gained])
 
     def touchdown(
         self, now: Motion, turn: np.ndarray, left_s: float

@@ -125,7 +125,7 @@ class Passage:
         if self._due_s - t > self.near_s and np.isfinite(left):
             self._due_s = t + left
         left = max(self._due_s - t, 0.0)
-        aimed = 0.0
+        aimed = 0.0, 0.0, 0.0
         if self.reaim is not None:
             aimed = self.reaim.correction(now, self.flight.turn_ahead(step, now, left), left)
         before = self.shift_s

@@ -9,7 +9,7 @@ import numpy as np
 from jumplab.errors import InputError, quoted
 from jumplab.robot.legs import Size
 
-LATE_SHARE = 0.4  # of the flight, at its end: by then a flip has folded
+LATE_SHARE = 0.5  # of the flight, at its end: by then a flip has folded
 RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
 
 
@@ -76,9 +76,11 @@ class Limits:
     # in the plane instead, least and most of flips backward, then forward (measured: with which
     # most robots unlike their model stand); of robots that move in the plane alone, and of others
     capture_in_plane: tuple[float, float, float, float] = (0.045, 0.065, 0.070, 0.116)
-    capture_even: tuple[float, float, float, float] = (0.0, 0.02, 0.03, 0.07)
-    # of the speed limit, in the last :data:`LATE_SHARE` of the flight, if it is less
+    capture_even: tuple[float, float, float, float] = (-0.03, -0.01, 0.03, 0.07)
+    # of the speed limit and of the peak torque, in the last :data:`LATE_SHARE` of the flight,
+    # where they are less
     opening_speed_share: float = 1.0
+    opening_torque_share: float = 1.0
     # where left and right move differently
     side_margin_m: float = 0.02  # CoP inside the sole's sides
     torsion_arm_m: float = 0.045  # on which friction resists the spin of a foot

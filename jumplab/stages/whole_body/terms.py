@@ -469,18 +469,29 @@ def flight_rows(m: Mode) -> list[Term]:
 
 
 def opening_rows(m: Mode) -> list[Term]:
-    """If asked, joints open a tuck so slowly that they could do so later and faster; it sets in
-    gradually.
+    """If asked, joints open a tuck so slowly, and with so little torque, that they could do so
+    later and faster; it sets in gradually.
     """
-    if m.limits.opening_speed_share >= m.limits.speed_share:
-        return []
-    most = m.limits.opening_speed_share * m.motors.speed
+    lim = m.limits
+
+    def late(p):
+        return ca.fmax(0, ca.fmin(1, 20 * (p.s - 1 + LATE_SHARE)))
 
     def rates(p):
-        return ca.fmax(0, ca.fmin(1, 10 * (p.s - 1 + LATE_SHARE))) * p.rates
+        return late(p) * p.rates
 
-    words = "opening speed", "ours, for flips", "rad/s", "node"
-    return [limit(*words, rates, -most, most, scale=10.0, skip=(1, 0))]
+    def torques(p):
+        return late(p) * p.motor_torques / ca.DM(m.motors.effort)
+
+    rows = []
+    if lim.opening_speed_share < lim.speed_share:
+        most = lim.opening_speed_share * m.motors.speed
+        words = "opening speed", "ours, for flips", "rad/s", "node"
+        rows.append(limit(*words, rates, -most, most, scale=10.0, skip=(1, 0)))
+    if (most := lim.opening_torque_share) < lim.torque_share:
+        words = "opening torque", "ours, for flips", "of the effort", "node"
+        rows.append(limit(*words, torques, -most, most, skip=(1, 0)))
+    return rows
 
 
 # a target
