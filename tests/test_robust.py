@@ -123,6 +123,8 @@ def test_a_flip_allows_for_other_robots_by_a_slow_opening(bhr):
         friction=0.38,
         body_clearance_m=0.06,
         opening_speed_share=robust.OPENING_SHARE,
+        opening_torque_share=robust.OPENING_TORQUE_SHARE,
+        touchdown_ankle_stroke=robust.ANKLE_STROKE_RAD,
         torque_share=found["limits"]["torque_share"],
     )
     own = robust.robust_changes(flip, bhr, Ranges(), {"limits": {"opening_speed_share": 0.5}})

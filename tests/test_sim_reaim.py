@@ -129,7 +129,7 @@ def test_arms_swing_only_if_the_trunk_will_be_far_forward(bhr, reaim, pitch_rad,
     high = turned(tape.q[-1], turn)
     high[2] += 1.0
     now = Gauge(bhr).motion(high, tape.v[-1])
-    arms = reaim.correction(now, turn, 0.4)[joints_of(bhr, "shoulder_pitch")]
+    arms = reaim.correction(now, turn, 0.4)[0, joints_of(bhr, "shoulder_pitch")]
     if pitch_rad < FAR_RAD:
         assert not arms.any()
         return

@@ -20,11 +20,16 @@ from jumplab.robot.legs import leg_columns, size
 from jumplab.robot.stance import knees
 
 START_S = 0.12  # before touchdown; earlier, the correction fights the swing itself
-# [s] a correction aims at a touchdown that is at least so far ahead, or noise would shake the legs
-LEAST_S = 0.04
+# [rad/s] 0.8 rad within the last 0.2 m at 3 m/s, two thirds of the speed limit of the hip
+RATE = 12.0
 LARGEST_RAD = 0.8  # beyond 45 degrees the planned landing posture is lost anyway
 FASTEST_FALL = 1.0  # [m/s] below it the foothold says little about the moment
-SIDE_START_S = 0.20  # yaw and roll joints swing nothing, and move legs that are heavy
+# [s], [rad/s] yaw and roll joints swing nothing, and move legs that are heavy
+SIDE_START_S = 0.20
+SIDE_RATE = 8.0
+# [s] in flips, a correction aims at a touchdown that is at least so far ahead, or noise would
+# shake the legs
+LEAST_S = 0.04
 NEWTON_STEPS = 3  # twelve equations, nearly linear
 # of a sole's miss: forward, sideways, up [1/m], turned about these axes [1/rad]; a sole off the
 # level tips, a leg can hardly go inwards, and no landing hangs on where a foot points
@@ -78,6 +83,7 @@ class Reaim:
         self._pitching = np.isin(names, [name for name, _, _ in robot.role_signs()])
         self._is_arm = np.isin(names, robot.joints["shoulder_pitch"])
         self._start_s = large.of(np.where(self._pitching, START_S, SIDE_START_S), "s")
+        self._most = STEP_S * large.of(np.where(self._pitching, RATE, SIDE_RATE), "rad/s")
         self._least_s = large.of(LEAST_S, "s")
         self._limbs = np.concatenate([self._legs, np.flatnonzero(self._is_arm)])
         self._low, self._high = self._range(robot)
@@ -109,8 +115,10 @@ class Reaim:
         """Angles, rates and accelerations (3, nv - 6) to add to the tape's; call it once per step.
 
         ``turn`` (3, 3) is the trunk's attitude at touchdown, in ``left_s``, times that of the plan
-        transposed. The correction comes to rest at what :meth:`touchdown` asks for, by the cubic
-        way that is left: drives that are sent angles alone lag behind by some centimetres of sole.
+        transposed. In a flip, whose legs are still opening, the correction comes to rest at what
+        :meth:`touchdown` asks for by the cubic way that is left: drives that are sent angles alone
+        lag behind by some centimetres of sole. Otherwise angles alone move, by :data:`RATE` at
+        most: shoved robots whose arms arrive by such a way swing them too far, and fall.
         """
         tilt = pin.log3(turn)[:2]
         ahead = tilt[1] > 0 and np.abs(tilt).max() > FAR_RAD
@@ -118,11 +126,13 @@ class Reaim:
         moving = (left_s < self._start_s) | (self._is_arm & self._far)
         gained = np.zeros(len(moving))
         if np.any(moving):
-            way = self.touchdown(now, turn, left_s)[0] - self._now
-            lasts_s = max(left_s, self._least_s)
-            gained = np.where(moving, 6 * way / lasts_s**2 - 4 * self._rate / lasts_s, 0.0)
-            self._rate = self._rate + STEP_S * gained
-            self._now = self._now + STEP_S * self._rate
+            way = np.where(moving, self.touchdown(now, turn, left_s)[0] - self._now, 0.0)
+            if self._legs_alone:
+                lasts_s = max(left_s, self._least_s)
+                gained = np.where(moving, 6 * way / lasts_s**2 - 4 * self._rate / lasts_s, 0.0)
+                self._rate = self._rate + STEP_S * gained
+                way = STEP_S * self._rate
+            self._now = self._now + np.clip(way, -self._most, self._most)
         return np.stack([self._now, self._rate, gained])
 
     def touchdown(
