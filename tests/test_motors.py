@@ -25,6 +25,7 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.sim import INSTALLED, STEP_S, simulate_jump
+from jumplab.sim.armature import Armature
 from jumplab.sim.checks import check
 from jumplab.sim.engine import engine_class
 from jumplab.stages.planner import Planner
@@ -271,6 +272,29 @@ def test_a_pendulum_with_a_motor(bhr, engine, keys):
     push, damping = torque - row["friction"], row["damping"]
     due = push / damping * (1 - np.exp(-damping * t / inertia)) if damping else push * t / inertia
     assert rate == pytest.approx(due, rel=2e-3 if keys != KEYS else 2e-2)  # engines let dry friction grow with the rate
+
+
+def test_lent_inertia_is_reckoned_as_an_engine_feels_it_in_an_impact(heavy):
+    """By inverse dynamics of the tree with and without it, in a step that turns joints by 30 rad/s."""
+    robot, rng = heavy, np.random.default_rng(0)
+    model = robot.model
+    q, v = [stance_configuration(robot)], [rng.normal(0.0, 2.0, model.nv)]
+    for faster in (1.0, 30.0):
+        v.append(v[-1] + faster * rng.normal(size=model.nv))
+        q.append(pin.integrate(model, q[-1], STEP_S * v[-1]))
+    engine = Armature(robot)
+    lent = model.copy()
+    for link, inertia in engine.lent.items():
+        body = lent.frames[lent.getFrameId(link, pin.FrameType.BODY)].parentJoint
+        lent.inertias[body] += pin.Inertia(0.0, np.zeros(3), inertia * np.eye(3))
+    engine.returned(q[0], v[0])
+    given = engine.returned(q[1], v[1])
+    gained = (v[2] - v[1]) / STEP_S
+    felt, bare = (pin.rnea(tree, tree.createData(), q[1], v[1], gained) for tree in (lent, model))
+    felt[6:] -= robot.limits.armature * gained[6:]
+    late = Armature(robot).late(np.array(q), np.array(v))[1]
+    assert np.abs(late).max() > 10.0
+    np.testing.assert_allclose(late, given - (felt - bare), atol=1e-8 * np.abs(late).max())
 
 
 @pytest.mark.parametrize("engine", INSTALLED)

@@ -9,7 +9,7 @@ from jumplab.control.controller import level
 from jumplab.control.flight import Flight
 from jumplab.control.kinematics import Gauge, headed, rotation, turned, yaw_of
 from jumplab.control.reaim import FAR_RAD, Reaim, least_within
-from jumplab.sim import INSTALLED, Perturbation, Shove, simulate_jump
+from jumplab.sim import INSTALLED, STEP_S, Perturbation, Shove, simulate_jump
 
 
 @pytest.fixture
@@ -139,6 +139,23 @@ def test_arms_swing_only_if_the_trunk_will_be_far_forward(bhr, reaim, pitch_rad,
     assert (carried * arms > 0).all()
     reaim.correction(now, tilted_ahead(0.0), 0.3)
     assert reaim.correction(now, tilted_ahead(0.0), 0.3).any()  # they go on until touchdown
+
+
+def test_legs_of_a_flip_come_to_rest_at_their_correction(bhr, tape):
+    """All that is sent is one motion: angles, their rates, and the rates of those."""
+    reaim = Reaim(bhr, tape, legs_alone=True)
+    end, turn = Gauge(bhr).motion(tape.q[-1], tape.v[-1]), tilted_ahead(0.05)
+    left = np.arange(0.2, 0.0, -STEP_S)
+    falls = [end._replace(velocity=np.array([0.3, 0.0, 9.8 * x - 3.0])) for x in left]
+    sent = np.array([reaim.correction(now, turn, x) for now, x in zip(falls, left, strict=True)])
+    angles, rates, gained = sent.swapaxes(0, 1)
+    goal = reaim.touchdown(falls[-1], turn, left[-1])[0]
+    np.testing.assert_allclose(np.diff(angles, axis=0), STEP_S * rates[1:], atol=1e-12)
+    np.testing.assert_allclose(np.diff(rates, axis=0), STEP_S * gained[1:], atol=1e-9)
+    largest = np.abs(goal).argmax()
+    assert abs(goal[largest]) > 0.05
+    assert angles[-1, largest] == pytest.approx(goal[largest], rel=0.1)
+    assert abs(rates[-1, largest]) < 0.3 * np.abs(rates[:, largest]).max()
 
 
 def test_bounded_least_squares():
