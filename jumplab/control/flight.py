@@ -100,9 +100,9 @@ class Flight:
         late = self._t >= self.from_s
         self.tight_s = float(self._t[late][np.argmin(self._inertias[late, 1, 1])])
         # a tuck that waits shall still open within the speeds and torques of the joints
-        opens = self._t >= self.tight_s
+        after = self._t >= self.tight_s
         motors = robot.limits
-        used = np.abs([rates[opens, 6:] / motors.speed, tape.tau[flight][opens] / motors.effort])
+        used = np.abs([rates[after, 6:] / motors.speed, tape.tau[flight][after] / motors.effort])
         speed, torque = used.max(axis=(1, 2), initial=NOTHING)
         # torques grow with the square of the pace
         faster = float(min(1 / speed, np.sqrt(REACH / torque)))

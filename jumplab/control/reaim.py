@@ -127,12 +127,13 @@ class Reaim:
         gained = np.zeros(len(moving))
         if np.any(moving):
             way = np.where(moving, self.touchdown(now, turn, left_s)[0] - self._now, 0.0)
+            step = np.clip(way, -self._most, self._most)
             if self._legs_alone:
                 lasts_s = max(left_s, self._least_s)
-                gained = np.where(moving, 6 * way / lasts_s**2 - 4 * self._rate / lasts_s, 0.0)
+                gained = 6 * way / lasts_s**2 - 4 * self._rate / lasts_s
                 self._rate = self._rate + STEP_S * gained
-                way = STEP_S * self._rate
-            self._now = self._now + np.clip(way, -self._most, self._most)
+                step = STEP_S * self._rate
+            self._now = self._now + step
         return np.stack([self._now, self._rate, gained])
 
     def touchdown(

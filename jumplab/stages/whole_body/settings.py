@@ -9,7 +9,9 @@ import numpy as np
 from jumplab.errors import InputError, quoted
 from jumplab.robot.legs import Size
 
-LATE_SHARE = 0.5  # of the flight, at its end: by then a flip has folded
+# of the flight, at its end: by then a flip has folded; the hardest push of an opening comes in the
+# first fifth of it
+LATE_SHARE = 0.5
 RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
 
 
