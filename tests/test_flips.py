@@ -12,7 +12,7 @@ from paper.planar import planar_quantities
 
 from jumplab import auditing as passport
 from jumplab import plan as planned
-from jumplab.control.controller import level
+from jumplab.control.controller import Controller, level
 from jumplab.control.flight import LATER_S, SOONER_S, Flight, is_flip
 from jumplab.control.kinematics import Gauge, rotation, turned
 from jumplab.control.playback import Playback
@@ -162,6 +162,16 @@ def test_joints_follow_a_tuck_that_opens_sooner(monkeypatch):
     flown = slice(plan.tape.takeoff_index + 50, len(asked) - 130)  # until legs are aimed as well
     lag = result.q[flown, 7:] - np.array([x.q for x in asked])[flown]
     assert np.abs(lag).max() < 0.025
+
+
+def test_feet_that_point_backwards_upside_down_have_not_turned():
+    """A robot that flies rolled by 3 degrees: its feet's headings, unwrapped sample by sample, go once round."""
+    tape, robot = backflip().tape, backflip().robot
+    rolled = pin.rpy.rpyToMatrix(0.05, 0.0, 0.0)
+    q = np.array([turned(row, rolled) for row in tape.q])
+    headings = np.unwrap([Gauge(robot).heading(row) for row in q[tape.flights[-1]]])
+    assert abs(headings[-1] - headings[0]) == pytest.approx(TURN, abs=0.05)
+    assert Controller(replace(tape, q=q), robot).ahead.to_json()["reason"] is None
 
 
 @pytest.mark.parametrize("flight_s", [0.35, 0.5, 0.65, 0.9])

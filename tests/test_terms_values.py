@@ -585,13 +585,16 @@ def test_flips_in_space_are_caught_by_their_momentum(body):
 
 @pytest.mark.parametrize("share, begun", [(0.45, 0.0), (1 - LATE_SHARE + 0.025, 0.5), (0.9, 1.0)])
 def test_a_tuck_opens_slowly_if_asked(body, share, begun):
-    limits = Limits(opening_speed_share=0.5)
+    limits = Limits(opening_speed_share=0.5, opening_torque_share=0.3)
     problem = Schedule(body, jump_contacts(limits, Mesh()), limits, Weights(), free=coordinates.even(body)).problem()
     phase, p = random_point(problem, "flight", 1, PLANE, s=share)
-    term = of(problem, "flight", "node")["opening speed"]
+    speed, torque = (of(problem, "flight", "node")[f"opening {x}"] for x in ("speed", "torque"))
     x = Seen(body, phase, p, {})
-    check({"opening speed": term}, {"opening speed": begun * x.rates[[6 + k for k in x.joints]]}, p)
-    assert term.upper == pytest.approx(0.5 * x.motor("speed")) and term.lower == pytest.approx(-term.upper)
+    torques = begun * x.tau / x.motor("effort")
+    found = {"opening speed": begun * x.rates[[6 + k for k in x.joints]], "opening torque": torques}
+    check({"opening speed": speed, "opening torque": torque}, found, p)
+    assert speed.upper == pytest.approx(0.5 * x.motor("speed")) and speed.lower == pytest.approx(-speed.upper)
+    assert (torque.lower, torque.upper) == (-0.3, 0.3)
 
 
 # stage 1 --------------------------------------------------------------------------------------------------------

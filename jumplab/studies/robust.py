@@ -42,8 +42,7 @@ OPENING_SHARE = 0.4
 # of the torques: an opening at 1.6 times the pace takes 0.9 of them
 OPENING_TORQUE_SHARE = 0.35
 # [rad] left to the ankles' stop at touchdown: robots that fly backwards need it, with their feet
-# behind them. Of 40 perturbed backflips of a G1 36 stand in
-# PyBullet, 33 with the usual 0.12
+# behind them. Of 40 perturbed backflips of a G1 36 stand in PyBullet, 33 with the usual 0.12
 ANKLE_STROKE_RAD = 0.3
 # of robots that do not move in the plane alone: perturbed backflips of a G1 are caught with -0.09
 # to 0.13 m^2/s about the soles over the mass, and fall mostly below
