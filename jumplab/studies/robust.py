@@ -62,12 +62,12 @@ def robust_changes(
     ``ranges``.
 
     In place of the capture window stands the cost of :func:`capture_term` over sampled robots; a
-    flip keeps its own rows for that, opens its tuck with :data:`OPENING_SHARE` of the joints'
-    speeds and :data:`OPENING_TORQUE_SHARE` of their torques, keeps :data:`ANKLE_STROKE_RAD` of its
-    ankles' way, and leaves the torque that heavier links and weaker motors take. Friction, torque
-    and speed are used up to the least that ``ranges`` leave. Other differences (delay, ground,
-    shoves, sensors, posture; motors of jumps) are not seen: they do not depend on the plan's masses
-    or limits. Own limits win.
+    flip keeps its own rows for that (of robots that move in space with :data:`CAPTURE_EVEN`), opens
+    its tuck with :data:`OPENING_SHARE` of the joints' speeds and :data:`OPENING_TORQUE_SHARE` of
+    their torques, keeps :data:`ANKLE_STROKE_RAD` of its ankles' way, and leaves the torque that
+    heavier links and weaker motors take. Friction, torque and speed are used up to the least that
+    ``ranges`` leave. Other differences (delay, ground, shoves, sensors, posture; motors of jumps)
+    are not seen: they do not depend on the plan's masses or limits. Own limits win.
 
     Raises :class:`InputError` if ``ranges`` have nothing that a plan can allow for.
     """
