@@ -101,8 +101,10 @@ def test_patience_is_a_number_of_seconds(monkeypatch):
         advice.plan_or_advise(planner, JumpTask(0.2, 0.3), patience_s=1e-9)
     given_up = "no; planning was given up after 1e-09 s of processor time; ask for a distance of 0.12 m "
     assert str(e.value) == f"{given_up}and a height of 0.18 m, which has a plan"  # far easier: little time is left
-    said = refused(advice.plan_or_advise, planner, JumpTask(0.2, 0.3, platform_m=0.2), patience_s=1e-9, by=SolverError)
-    assert said.endswith("; ask for a platform of 0.07 m, which has a plan")
+    for far, easier in ((0.6, "a platform of 0.07 m"), (0.2, "a distance of 0.52 m and a platform of 0.12 m")):
+        high = JumpTask(far, 0.3, platform_m=0.2)
+        said = refused(advice.plan_or_advise, planner, high, patience_s=1e-9, by=SolverError)
+        assert said.endswith(f"; ask for {easier}, which has a plan")
     with pytest.raises(InputError, match="patience_s must be a positive number of seconds, got 0"):
         jl.plan(JumpTask(0.2, 0.3), patience_s=0)
 

@@ -19,6 +19,7 @@ from jumplab.ocp.nlp import LEAST_S, left_s, patience, unexplained
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
+from jumplab.stages.whole_body.ground import roomy_m
 from jumplab.task import RANGES, JumpTask
 
 MILDER = 0.6  # of a number that was refused
@@ -134,7 +135,8 @@ def _advice(
         last = easier
         for step in range(steps):
             # a lower jump onto a platform is no easier one
-            easier = _easier(easier, refusal, number + step * (not task.platform_m)) or easier
+            tries = number + step * (not task.platform_m)
+            easier = _easier(easier, refusal, tries, planner.robot) or easier
         number += steps
         if easier == last or left_s() <= 0:
             break
@@ -187,12 +189,15 @@ def words(task: JumpTask, easier: JumpTask) -> str:
     return " and ".join(changes)
 
 
-def _easier(task: JumpTask, refusal: JumplabError, tried: int) -> JumpTask | None:
-    """An easier target than one that got this ``refusal``, the number ``tried``; None if there is
-    none.
+def _easier(task: JumpTask, refusal: JumplabError, tried: int, robot: Robot) -> JumpTask | None:
+    """An easier target of a ``robot`` than one that got this ``refusal``, the number ``tried``;
+    None if there is none.
     """
     bound = getattr(refusal, "bound", None)
-    if bound is None:
+    ahead = task.in_plane and task.platform_m > 0
+    if bound is None and ahead and task.distance_m < roomy_m(robot):
+        changes = {"distance_m": roomy_m(robot)}
+    elif bound is None:
         changes = _milder(task, tried)
     else:  # the least distance that its platform takes, or the most that any motion reaches
         x = getattr(task, refusal.number)

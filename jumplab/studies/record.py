@@ -29,6 +29,7 @@ from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits, Mesh, bounds
 from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.ground import roomy_m
 from jumplab.stages.whole_body.limiting import limit_of
 from jumplab.stages.whole_body.problem import SOUGHT
 from jumplab.stages.whole_body.program import Program, Solved
@@ -62,7 +63,6 @@ HALVING_S = 6e-3
 LESS = 0.05  # of the share of a record that is played next, where a robot falls
 TRIED = 5  # shares that are played
 NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds
-PLATFORM_ROOM_M = 0.1  # of a platform's distance, over the least that it takes
 BINDS = 1e-2  # [m, m/s, rad] that the whole of a limit is worth at least, to be named
 BINDING_SHARE = 0.05  # of its largest multiplier: from there to there it binds
 LOOSE = 3.0  # times a record, from where on a bound says nothing
@@ -208,9 +208,9 @@ def record(
     ----------
     robot : who jumps, or what :meth:`Robot.load` takes.
     what : the number: "height_m", "distance_m", "platform_m", "side_m" or "yaw_rad".
-    given : the rest of the target; by default a jump on the spot (a platform as near as it can be),
-        with the rise that gives most. With steps, or on one foot, only a height or a distance on
-        level ground has a record.
+    given : the rest of the target; by default a jump on the spot (onto a platform with room for the
+        shanks before it), with the rise that gives most. With steps, or on one foot, only a height
+        or a distance on level ground has a record.
     share : of the record; a jump of this share is played first, a smaller one if the robot falls.
     engines : in which it is played; () plays none.
     terms, weights, off, limits, mesh : as of :class:`jumplab.Planner`.
@@ -454,15 +454,21 @@ class _Search:
     def played(
         self, plan: JumpPlan, share: float, engines: Sequence[str]
     ) -> tuple[float, dict[str, SimulationResult]]:
-        """A plan at a ``share`` [1] of the record, played in all ``engines``: of several shares,
-        each :data:`LESS` than the one before, the first that lands in all, else the last one.
+        """A plan at a ``share`` [1] of the record, and of its rise where that was sought besides,
+        played in all ``engines``: of several shares, each :data:`LESS` than the one before, the
+        first that lands in all, else the last one.
         """
         runs: dict[str, SimulationResult] = {}
-        task = plan.task
+        most = plan.task
+        rises = "takeoff_speed" in self.sought
         for tried in [share - LESS * less for less in range(TRIED if engines else 0)]:
             tell(f"playing {tried:.0%} of the record")
             with suppress(InfeasibleError, SolverError):
-                plan = self.planner.plan(self.at(task, tried), "direct", near=plan)
+                task = self.at(most, tried)
+                if rises:
+                    rise = max(tried * most.height_m, RANGES["height_m"][1])
+                    task = replace(task, height_m=rise)
+                plan = self.planner.plan(task, "direct", near=plan)
                 scene = Scene.of_plan(plan.summary, plan.robot)
                 given = plan.tape, plan.robot
                 runs = {x: simulate_jump(*given, scene=scene, engine=x) for x in engines}
@@ -478,11 +484,10 @@ def unit_of(name: str) -> str:
 
 
 def _usual(body: Body, what: str) -> JumpTask:
-    """The rest of a target where nothing is said: on the spot, a platform as near as it can be."""
-    near = 0.0
-    if what == "platform_m":
-        near = 2 * body.half_m + Limits().edge_before_heel_m + PLATFORM_ROOM_M
-    return JumpTask(near, 0.2)
+    """The rest of a target where nothing is said: on the spot, a platform as near as it leaves room
+    to crouch.
+    """
+    return JumpTask(roomy_m(body.robot) if what == "platform_m" else 0.0, 0.2)
 
 
 # what ends it

@@ -28,6 +28,7 @@ from jumplab.robot import Robot
 from jumplab.show.tables import Table, table
 from jumplab.sim import INSTALLED, Ranges, Scene
 from jumplab.stages.planner import Planner
+from jumplab.stages.whole_body.ground import roomy_m
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trial
 from jumplab.task import JumpTask
 from paper import logs
@@ -63,6 +64,7 @@ def targets() -> dict[str, list[dict[str, Any]]]:
     def drawn(low: float, high: float) -> float:
         return round(float(rng.uniform(low, high)), 2)
 
+    near = roomy_m(Robot.load(ROBOT))
     asked: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
     for kind, number in zip(KINDS, TARGETS, strict=False):
         for k in range(number):
@@ -75,7 +77,7 @@ def targets() -> dict[str, list[dict[str, Any]]]:
                 "quarter turn": {"distance_m": far / 2, "height_m": rise, "yaw_rad": way * math.pi / 2},
                 "half turn": {"distance_m": 0.0, "height_m": max(rise, 0.2), "yaw_rad": way * math.pi},
                 "platform": {
-                    "distance_m": max(far, 0.3),
+                    "distance_m": max(far, near),
                     "height_m": round(rise + 0.15, 2),
                     "platform_m": min(rise, 0.3),
                 },
@@ -128,6 +130,8 @@ def attempt(kind: str, target: dict[str, Any]) -> dict[str, Any]:
     row["said"] = "; ".join(f"{c.name}: {c.value:.3g} {c.unit}, at most {c.limit:g}" for c in report.failed)
     if report.passed and kind != "weaker":
         row["landed"] = {engine: landing(plan, engine) for engine in INSTALLED}
+    if report.passed and kind == "flip":
+        row["re-aimed"] = {engine: landing(plan, engine, reaim=True) for engine in INSTALLED}
     count = MANY if kind == "perturbed" else PERTURBED if kind == "flip" and named(row) in THROWN else 0
     if count and report.passed:
         row["perturbed"] = {engine: thrown(plan, engine, count) for engine in INSTALLED}
@@ -140,9 +144,9 @@ def fullest(report: AuditReport) -> list[Any]:
     return [used.name, round(used.value, 1), used.note.rpartition("worst: ")[2]]
 
 
-def landing(plan: Any, engine: str) -> list[Any]:
+def landing(plan: Any, engine: str, **how: Any) -> list[Any]:
     """Whether a playback landed and its findings passed, distance and rise [m], and why it ended."""
-    run = api.simulate(plan, engine=engine)
+    run = api.simulate(plan, engine=engine, **how)
     far, high = run.metrics.foot_distance_m, run.metrics.com_rise_m
     return [run.landed and run.checks_passed, far and round(far, 3), high and round(high, 3), run.reason]
 
@@ -198,7 +202,9 @@ def flips(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         least = f"{min([x['effort'] for x in same], default=1.0):.0%}" if asked else ""
         line = {"flip": named(row), "plan": "clean" if row["clean"] else row["said"].split(";")[0]}
         line["fullest limit"] = "{}, {:.0f} %, {}".format(*row["used"]) if "used" in row else ""
-        line["lands"] = f"{sum(x[0] for x in row['landed'].values())} of {len(row['landed'])}" if row["clean"] else ""
+        for column, how in (("lands", "landed"), ("re-aimed", "re-aimed")):
+            runs = row.get(how, {}).values()
+            line[column] = f"{sum(x[0] for x in runs)} of {len(runs)}" if runs else ""
         line["of robots that differ"] = landings(row)
         out.append(line | {"also clean with motors of": least})
     return out

@@ -21,6 +21,8 @@ from jumplab.task import GRAVITY
 
 # of half the length of a shank's box, where a platform's edge may meet it
 SHANK_SHARES = -0.8, -0.4, 0.0, 0.4, 0.8
+LOCKED = 0.1  # of the determinant of a leg's Jacobian in the stance
+LOCK_STEP_RAD = 0.02
 Spot = tuple[int, np.ndarray]  # a body, and a place in its frame (3,) [m]
 
 
@@ -82,6 +84,35 @@ class Body:
             bent = sorted((sign * (least_rad - angle), sign * (most_rad - angle)))
             low[k] = max(low[k], bent[0])
             high[k] = min(high[k], bent[1])
+        return low, high
+
+    @cached_property
+    def unlocked(self) -> tuple[np.ndarray, np.ndarray]:
+        """Angles (joints,) [rad] between which each joint of a leg, the others as in the stance,
+        leaves its foot all six ways to move: the determinant of its Jacobian stays above
+        :data:`LOCKED` of that in the stance. Infinite for knees, which have a range of their own,
+        and for joints that never lock their leg, as the hip's pitch does between axes of yaw and
+        roll.
+        """
+        tree = self.robot.model
+        data = tree.createData()
+        low = np.full(tree.nv - BASE, -np.inf)
+        high = -low
+        q = stance_configuration(self.robot)
+        own = {k for k, _, _ in self.knees}
+        for foot, leg in zip(self.feet, self.legs, strict=True):
+            stops = self.motors.lower, self.motors.upper
+            for k in (column - BASE for column in leg if len(leg) == BASE):
+                angles = np.arange(stops[0][k], stops[1][k], LOCK_STEP_RAD)
+                moved = np.tile(q, (len(angles), 1))
+                moved[:, 7 + k] = angles
+                slopes = [pin.computeJointJacobian(tree, data, x, foot + 1)[:, leg] for x in moved]
+                ways = np.linalg.det(slopes)
+                stands = np.interp(q[7 + k], angles, ways)
+                locked = angles[ways / stands < LOCKED]
+                if k not in own and len(locked):
+                    low[k] = max(locked[locked < q[7 + k]], default=-np.inf)
+                    high[k] = min(locked[locked > q[7 + k]], default=np.inf)
         return low, high
 
     @cached_property

@@ -307,6 +307,9 @@ class Schedule:
             off = np.minimum(stance - motors.lower, motors.upper - stance)  # the nearer stop
             margin = np.maximum(margin, np.minimum(lim.rebound_range_rad, off / 2))
         low, high = self.body.ranges(margin, least, most)
+        if not free.plane:  # there, legs that lock move on
+            low = np.maximum(low, self.body.unlocked[0])
+            high = np.minimum(high, self.body.unlocked[1])
         low, high = free.within(np.concatenate([-wide, low]), np.concatenate([wide, high]))
         low = np.concatenate([low, none])
         high = np.concatenate([high, none + lim.heel_up_rad])
