@@ -15,8 +15,8 @@ from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.task import JumpTask
 
-# of a leg, from the toes to an edge: onto 0.19 m the G1 jumps at a third of the cost that it has at
-# half of this way, and onto a third of the height there
+# of a leg, from the toes to an edge: onto 0.19 m a jump of the G1 costs twice as much from half of
+# this way; there, 0.2 m are the highest that was found, 0.59 m from here
 CROUCH = 0.3
 
 
