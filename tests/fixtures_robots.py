@@ -117,17 +117,27 @@ def one_axis_ankle() -> tuple[str, str]:
     return text(robot), config("one_axis_ankle")
 
 
-def roll_first() -> tuple[str, str]:
-    """Ankle roll above ankle pitch."""
+def _swapped(at: str) -> str:
+    """Roll and pitch of hips or ankles in the other order."""
     robot = root()
     for side in ("left", "right"):
-        pitch, roll = joint(robot, f"{side}_ankle_pitch"), joint(robot, f"{side}_ankle_roll")
+        pitch, roll = joint(robot, f"{side}_{at}_pitch"), joint(robot, f"{side}_{at}_roll")
         for tag in ("axis", "limit"):
             a, b = pitch.find(tag), roll.find(tag)
             pitch.remove(a), roll.remove(b)
             pitch.append(b), roll.append(a)
-        pitch.set("name", f"{side}_ankle_roll"), roll.set("name", f"{side}_ankle_pitch")
-    return text(robot), config("roll_first")
+        pitch.set("name", f"{side}_{at}_roll"), roll.set("name", f"{side}_{at}_pitch")
+    return text(robot)
+
+
+def roll_first() -> tuple[str, str]:
+    """Ankle roll above ankle pitch."""
+    return _swapped("ankle"), config("roll_first")
+
+
+def pitch_first() -> tuple[str, str]:
+    """Hip pitch above hip roll, below hip yaw: with level thighs two axes are one line."""
+    return _swapped("hip"), config("pitch_first")
 
 
 def heavy_arms(mass_kg: float = 5.0) -> tuple[str, str]:

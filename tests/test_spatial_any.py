@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import refused
-from fixtures_robots import canted, config, joint, one_axis_ankle, root, text, write
+from fixtures_robots import canted, config, joint, one_axis_ankle, pitch_first, root, text, write
 from scipy.optimize import linprog
 
 import jumplab as jl
@@ -150,6 +150,24 @@ def test_start_values_of_a_motion_share_nodes_and_carry_the_robot(short):
     model, q = short.model, seen(schedule, motion)[1][-1]
     com = pin.centerOfMass(model, model.createData(), q)
     assert [parts[2].constants[f"com_{x}"] for x in "xyz"] == pytest.approx(com, abs=1e-9)
+
+
+def test_legs_keep_off_the_angle_that_locks_them(tmp_path):
+    """Between axes of yaw and roll the hip's pitch locks a leg at 90 degrees: what its foot can do goes with its
+    cosine. Other joints, and hips that roll before they pitch, lock nothing within their stops.
+    """
+    robot = Robot.load(write(tmp_path, pitch_first))
+    body = Body(robot)
+    names, stance = list(body.joint_names), body.stance[6:]
+    low, high = body.unlocked
+    k = names.index("left_hip_pitch")
+    least = np.arccos(0.1 * np.cos(stance[k]))
+    assert low[k] == pytest.approx(-least, abs=0.021) and -np.pi / 2 < low[k] == low[names.index("right_hip_pitch")]
+    others = [i for i, name in enumerate(names) if "hip_pitch" not in name]
+    assert np.isinf(low[others]).all() and np.isinf(high).all() and np.isinf(Body(Robot.load("bhr")).unlocked).all()
+    plan = jl.plan(jl.JumpTask(0.0, 0.3, side_m=0.15), robot)
+    bent = plan.tape.q[:, 7 + k].min()
+    assert plan.audit.passed and abs(bent - low[k]) < 0.03  # it crouches as far as it may
 
 
 def test_short_legs_do_not_stand_on_one_foot(short):

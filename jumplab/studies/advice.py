@@ -19,7 +19,7 @@ from jumplab.ocp.nlp import LEAST_S, left_s, patience, unexplained
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
-from jumplab.stages.whole_body.ground import roomy_m
+from jumplab.stages.whole_body.ground import clear_of_edge_m
 from jumplab.task import RANGES, JumpTask
 
 MILDER = 0.6  # of a number that was refused
@@ -195,8 +195,8 @@ def _easier(task: JumpTask, refusal: JumplabError, tried: int, robot: Robot) -> 
     """
     bound = getattr(refusal, "bound", None)
     ahead = task.in_plane and task.platform_m > 0
-    if bound is None and ahead and task.distance_m < roomy_m(robot):
-        changes = {"distance_m": roomy_m(robot)}
+    if bound is None and ahead and task.distance_m < clear_of_edge_m(robot):
+        changes = {"distance_m": clear_of_edge_m(robot)}
     elif bound is None:
         changes = _milder(task, tried)
     else:  # the least distance that its platform takes, or the most that any motion reaches

@@ -29,7 +29,7 @@ from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits, Mesh, bounds
 from jumplab.stages.whole_body.body import Body
-from jumplab.stages.whole_body.ground import roomy_m
+from jumplab.stages.whole_body.ground import clear_of_edge_m
 from jumplab.stages.whole_body.limiting import limit_of
 from jumplab.stages.whole_body.problem import SOUGHT
 from jumplab.stages.whole_body.program import Program, Solved
@@ -208,9 +208,9 @@ def record(
     ----------
     robot : who jumps, or what :meth:`Robot.load` takes.
     what : the number: "height_m", "distance_m", "platform_m", "side_m" or "yaw_rad".
-    given : the rest of the target; by default a jump on the spot (onto a platform with room for the
-        shanks before it), with the rise that gives most. With steps, or on one foot, only a height
-        or a distance on level ground has a record.
+    given : the rest of the target; by default a jump on the spot (onto a platform far enough ahead
+        to crouch before it), with the rise that gives most. With steps, or on one foot, only a
+        height or a distance on level ground has a record.
     share : of the record; a jump of this share is played first, a smaller one if the robot falls.
     engines : in which it is played; () plays none.
     terms, weights, off, limits, mesh : as of :class:`jumplab.Planner`.
@@ -305,9 +305,12 @@ class _Search:
                 break
 
     def from_easy(self) -> tuple[dict[str, float], Solved | None]:
-        """Results of all starts, and the best one; None if none of them led anywhere."""
+        """Results of all starts, and the best one; None if none of them led anywhere. Where that is
+        sought at once and no plan leads to it, they are climbed from.
+        """
         results: dict[str, float] = {}
         best: list[tuple] = []
+        planned = False
         for task in self.starts(best):
             size = f"{getattr(task, self.what):.3f} {unit_of(self.what)}"
             word = f"{size}, rise {task.height_m:.3f} m"
@@ -318,6 +321,7 @@ class _Search:
                 # after steps links meet, and a record begins with their rows
                 begin = self.stage.solved if task.standing else self.stage.plan
                 near = begin(task)
+                planned = True
                 if self.climbs:
                     most = max((x[0] for x in best), default=RANGES[self.what][2])
                     task, near = self.climbed(task, near, most)
@@ -329,6 +333,9 @@ class _Search:
             self.refuse_end(reached, solved)
             results[word] = getattr(reached, self.what)
             best.append((results[word], reached, solved))
+        if not best and planned and not self.climbs:
+            self.climbs = True
+            return self.from_easy()
         if not best:
             return results, None
         _, self.task, solved = max(best, key=itemgetter(0))
@@ -356,9 +363,9 @@ class _Search:
         return program.solve_apart(asked, SEEKING)
 
     def climbed(self, task: JumpTask, near: Solved, most: float) -> tuple[JumpTask, Solved]:
-        """The largest turn, or flight after steps, below ``most`` [rad, m] that plans lead to, each
-        from the one before, with rows for the links that met on the way: where the largest is
-        sought at once, legs pass through each other.
+        """The largest number below ``most`` [m, rad] that plans lead to, each from the one before,
+        with rows for the links that met on the way: where the largest turn, or flight after steps,
+        is sought at once, legs pass through each other.
         """
         with suppress(InfeasibleError, SolverError):
             while GROWS * getattr(task, self.what) < most:
@@ -484,10 +491,10 @@ def unit_of(name: str) -> str:
 
 
 def _usual(body: Body, what: str) -> JumpTask:
-    """The rest of a target where nothing is said: on the spot, a platform as near as it leaves room
-    to crouch.
+    """The rest of a target where nothing is said: on the spot, a platform far enough ahead to
+    crouch before it.
     """
-    return JumpTask(roomy_m(body.robot) if what == "platform_m" else 0.0, 0.2)
+    return JumpTask(clear_of_edge_m(body.robot) if what == "platform_m" else 0.0, 0.2)
 
 
 # what ends it

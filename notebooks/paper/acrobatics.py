@@ -28,7 +28,7 @@ from jumplab.robot import Robot
 from jumplab.show.tables import Table, table
 from jumplab.sim import INSTALLED, Ranges, Scene
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body.ground import roomy_m
+from jumplab.stages.whole_body.ground import clear_of_edge_m
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trial
 from jumplab.task import JumpTask
 from paper import logs
@@ -64,7 +64,7 @@ def targets() -> dict[str, list[dict[str, Any]]]:
     def drawn(low: float, high: float) -> float:
         return round(float(rng.uniform(low, high)), 2)
 
-    near = roomy_m(Robot.load(ROBOT))
+    near = clear_of_edge_m(Robot.load(ROBOT))
     asked: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
     for kind, number in zip(KINDS, TARGETS, strict=False):
         for k in range(number):

@@ -22,7 +22,7 @@ from jumplab.task import GRAVITY
 # of half the length of a shank's box, where a platform's edge may meet it
 SHANK_SHARES = -0.8, -0.4, 0.0, 0.4, 0.8
 LOCKED = 0.1  # of the determinant of a leg's Jacobian in the stance
-LOCK_STEP_RAD = 0.02
+LOCK_STEP_RAD = 0.02  # between the angles that are looked at
 Spot = tuple[int, np.ndarray]  # a body, and a place in its frame (3,) [m]
 
 

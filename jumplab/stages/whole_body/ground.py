@@ -80,7 +80,7 @@ def platform_edge_m(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> 
     return Surface.between(0.0, heel, task.platform_m, limits).edge_m
 
 
-def roomy_m(robot: Robot, limits: Limits = Limits()) -> float:
+def clear_of_edge_m(robot: Robot, limits: Limits = Limits()) -> float:
     """Distance of a platform from which on its edge is far enough for a crouch, in which shanks
     lean over the toes [m], to whole centimetres.
     """
