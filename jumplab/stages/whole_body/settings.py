@@ -78,7 +78,7 @@ class Limits:
     # in the plane instead, least and most of flips backward, then forward (measured: with which
     # most robots unlike their model stand); of robots that move in the plane alone, and of others
     capture_in_plane: tuple[float, float, float, float] = (0.045, 0.065, 0.070, 0.116)
-    capture_even: tuple[float, float, float, float] = (0.0, 0.02, 0.03, 0.07)
+    capture_even: tuple[float, float, float, float] = (0.0, 0.02, 0.07, 0.09)
     # of the speed limit and of the peak torque, in the last :data:`LATE_SHARE` of the flight,
     # where they are less
     opening_speed_share: float = 1.0
