@@ -98,7 +98,7 @@ def _low(
     tape: Tape, robot: Robot, surface: Surface, origin: np.ndarray, turn: np.ndarray
 ) -> np.ndarray:
     """Share (n, 2) of what soles in the air may be too low, in the middle of a flight under
-    :data:`CLEAR_M`.
+    :data:`CLEAR_M`, and at a touchdown off the ground.
 
     ``origin`` (n, 2, 3) [m] and ``turn`` (n, 2, 3, 3) are places and attitudes of the feet.
     """
@@ -106,12 +106,15 @@ def _low(
     heels, toes = np.split(robot.foot.corners, 2)
     sole = np.concatenate([heels + share * (toes - heels) for share in SOLE_SHARES])
     points = origin[:, :, None] + np.einsum("nkij,pj->nkpi", turn, sole)
-    height = (points[..., 2] - surface.below(points)).min(axis=2)
+    heights = points[..., 2] - surface.below(points)
+    height = heights.min(axis=2)
     shares = np.where(tape.contacts > 0, -np.inf, -height / SUNK_M)
     for rows in tape.flights:
         t = tape.t[rows] - tape.t[rows.start]
         middle = (t >= MIDDLE[0] * t[-1]) & (t <= MIDDLE[1] * t[-1])
         shares[rows] = np.where(middle[:, None], 2 - height[rows] / clear, -height[rows] / SUNK_M)
+    if not tape.contacts[-1].any():  # it ends as both soles meet the ground
+        shares[-1] = np.abs(heights[-1]).max(axis=-1) / SUNK_M
     return shares
 
 
