@@ -369,7 +369,12 @@ def test_soles_that_are_low_between_the_nodes_are_seen(bhr):
         moved[k, 2] -= _lowest(bhr, tape.q[k], surface) - low + depth
         assert np.isclose(_lowest(bhr, moved[k], surface), low - depth)
         alone = replace(tape, q=moved)
-        assert used_between(alone, bhr, surface) > max(1, used_between(alone, bhr, Surface(-1.0, -9.0)))
+        assert used_between(alone, bhr, surface) > 1
+    for lift in (0.0005, 0.002, -0.002):  # a touchdown above or below the ground
+        moved = tape.q.copy()
+        moved[-1, 2] += lift
+        used = used_between(replace(tape, q=moved), bhr, surface)
+        assert (used > 1) == (abs(lift) > between.SUNK_M) and used >= abs(lift) / between.SUNK_M - 0.01
     assert used_between(tape, bhr, replace(surface, edge_m=surface.edge_m - 0.3)) > 1
 
 

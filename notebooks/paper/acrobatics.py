@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from functools import cache
-from itertools import chain, repeat, zip_longest
+from itertools import chain, count, repeat, zip_longest
 from operator import itemgetter
 from pathlib import Path
 from types import SimpleNamespace
@@ -67,7 +67,9 @@ def targets() -> dict[str, list[dict[str, Any]]]:
     near = clear_of_edge_m(Robot.load(ROBOT))
     asked: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
     for kind, number in zip(KINDS, TARGETS, strict=False):
-        for k in range(number):
+        for k in count():
+            if len(asked[kind]) == number:
+                break
             rise = drawn(0.1, 0.35)  # onto a platform that high, at most 0.3 m, by 0.15 m more
             far = drawn(0.1, min(0.9, FAR * rise))
             way = 1.0 if k % 2 else -1.0
@@ -82,7 +84,8 @@ def targets() -> dict[str, list[dict[str, Any]]]:
                     "platform_m": min(rise, 0.3),
                 },
             }
-            asked[kind].append(found[kind])
+            if found[kind] not in asked[kind]:
+                asked[kind].append(found[kind])
     asked["perturbed"].append({"distance_m": 0.4, "height_m": 0.2})
     backflip = {"rotation_rad": -2 * math.pi, "distance_m": 0.0, "height_m": 0.5}
     asked["flip"].append(backflip | {"robust": True})
@@ -132,9 +135,9 @@ def attempt(kind: str, target: dict[str, Any]) -> dict[str, Any]:
         row["landed"] = {engine: landing(plan, engine) for engine in INSTALLED}
     if report.passed and kind == "flip":
         row["re-aimed"] = {engine: landing(plan, engine, reaim=True) for engine in INSTALLED}
-    count = MANY if kind == "perturbed" else PERTURBED if kind == "flip" and named(row) in THROWN else 0
-    if count and report.passed:
-        row["perturbed"] = {engine: thrown(plan, engine, count) for engine in INSTALLED}
+    robots = MANY if kind == "perturbed" else PERTURBED if kind == "flip" and named(row) in THROWN else 0
+    if robots and report.passed:
+        row["perturbed"] = {engine: thrown(plan, engine, robots) for engine in INSTALLED}
     return row
 
 
@@ -151,11 +154,11 @@ def landing(plan: Any, engine: str, **how: Any) -> list[Any]:
     return [run.landed and run.checks_passed, far and round(far, 3), high and round(high, 3), run.reason]
 
 
-def thrown(plan: Any, engine: str, count: int) -> list[bool]:
-    """Of ``count`` robots that differ from their model, whether each one lands, turned over where the plan is."""
+def thrown(plan: Any, engine: str, robots: int) -> list[bool]:
+    """Of ``robots`` that differ from their model, whether each one lands, turned over where the plan is."""
     settings = TrialSettings(engine=engine)
     there = SimpleNamespace(tape=plan.tape, robot=plan.robot, scene=Scene.flat())
-    keys = (TrialKey(0, k, settings.hash, "") for k in range(count))
+    keys = (TrialKey(0, k, settings.hash, "") for k in range(robots))
     trials = [run_trial(there, settings, k) for k in keys]
     turned = float(np.unwrap(pitch_of(plan.tape.q))[-1])
     return [t.landed and abs(t.metrics.touchdown_trunk_pitch_rad - turned) < math.pi / 2 for t in trials]

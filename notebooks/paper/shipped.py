@@ -26,6 +26,7 @@ from paper.humanoids import SHARES, leg_m
 
 LOG = Path(__file__).with_name("shipped.jsonl")
 FAR, HIGH = (0.0, 0.25, 0.5, 0.75, 1.0), (0.1, 0.2, 0.3, 0.4, 0.5)  # of the map, in lengths of the leg
+WAISTS = "waist", "torso"  # in names of joints
 LESS = (1.0, 0.75, 0.5, 0.25)  # of SHARES, the first that is clean and stands in every engine
 
 
@@ -76,8 +77,13 @@ def jumped(robot: Robot, size: float) -> dict[str, Any]:
 
 def mapped(row: Mapping[str, Any]) -> Envelope:
     """The map in a row, as :func:`jumplab.envelope` gives it."""
-    cells = (Cell(*cell[:4], float("nan") if cell[4] is None else cell[4]) for cell in row["cells"])
+    cells = (Cell(*cell[:3], _same(cell[3]), float("nan") if cell[4] is None else cell[4]) for cell in row["cells"])
     return Envelope(row["robot"], tuple(row["distances_m"]), tuple(row["heights_m"]), tuple(cells))
+
+
+def _same(limit: str) -> str:
+    """A limit in words that robots share, whatever their files call the joint below the trunk."""
+    return "waist torque" if any(name in limit.lower() for name in WAISTS) else limit
 
 
 def verdicts() -> list[dict[str, Any]]:
