@@ -14,6 +14,7 @@ from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.ocp import Bound, Nlp, Phase, PhaseGuess, Problem, Term
 from jumplab.ocp.nlp import patience
 from jumplab.show import price_bars
+from jumplab.stages.whole_body.program import Program
 from jumplab.studies import record as study
 
 pytestmark = pytest.mark.slow  # the record takes ten seconds, its prices as long
@@ -146,6 +147,36 @@ def test_a_share_of_a_rise_is_that_share_of_it(shares):
     parts = 32 * np.array([task.height_m / found.best for task, _ in asked])
     assert found.audit.passed and found.value > 0.9 * found.best
     assert parts[0] == pytest.approx(16) and parts == pytest.approx(np.round(parts), abs=1e-6)
+
+
+def test_where_nothing_is_found_at_once_plans_lead_there(bhr, monkeypatch):
+    solve, given = Program.solve_apart, jl.JumpTask(0.3, 0.2)
+
+    def not_at_once(self, asked, start):
+        if start is study.SEEKING:
+            raise SolverError("no way there at once")
+        return solve(self, asked, start)
+
+    usual = jl.record(bhr, "height_m", given, engines=())
+    monkeypatch.setattr(Program, "solve_apart", not_at_once)
+    found = jl.record(bhr, "height_m", given, engines=())
+    assert found.audit.passed and found.value == pytest.approx(usual.value, rel=0.02)
+
+
+@needs_published
+def test_a_record_is_played_at_a_share_of_its_rise_too(monkeypatch):
+    """Of what is sought and of the rise that was sought besides."""
+    plan, played = jl.Planner.plan, []
+
+    def noted(self, task, *given, **options):
+        played.append(task)
+        return plan(self, task, *given, **options)
+
+    monkeypatch.setattr(jl.Planner, "plan", noted)
+    found = jl.record("g1_legs", "platform_m", share=0.9, engines=["mujoco"])
+    most, (less, *_) = found.plan.task, played
+    assert (less.platform_m, less.height_m) == pytest.approx((0.9 * most.platform_m, 0.9 * most.height_m))
+    assert less.distance_m == most.distance_m and found.runs["mujoco"].landed
 
 
 def test_a_record_that_only_a_number_of_the_problem_ends_is_refused_in_a_sentence(bhr):
