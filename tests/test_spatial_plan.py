@@ -369,7 +369,7 @@ def test_soles_that_are_low_between_the_nodes_are_seen(bhr):
         moved[k, 2] -= _lowest(bhr, tape.q[k], surface) - low + depth
         assert np.isclose(_lowest(bhr, moved[k], surface), low - depth)
         alone = replace(tape, q=moved)
-        assert used_between(alone, bhr, surface) > 1
+        assert between.shares_between(alone, bhr, surface)["height of the soles"] > 1
     for lift in (0.0005, 0.002, -0.002):  # a touchdown above or below the ground
         moved = tape.q.copy()
         moved[-1, 2] += lift

@@ -83,7 +83,8 @@ def mapped(row: Mapping[str, Any]) -> Envelope:
 
 def _same(limit: str) -> str:
     """A limit in words that robots share, whatever their files call the joint below the trunk."""
-    return "waist torque" if any(name in limit.lower() for name in WAISTS) else limit
+    waist = any(name in limit.lower() for name in WAISTS)
+    return "waist torque" if waist and limit.endswith("torque") else limit
 
 
 def verdicts() -> list[dict[str, Any]]:
