@@ -194,8 +194,10 @@ def _easier(task: JumpTask, refusal: JumplabError, tried: int, robot: Robot) -> 
     None if there is none.
     """
     bound = getattr(refusal, "bound", None)
-    ahead = task.in_plane and task.platform_m > 0
-    if bound is None and ahead and task.distance_m < clear_of_edge_m(robot):
+    climbs = task.in_plane and task.standing and task.platform_m > 0
+    # an edge may be what is too near, unless the refusal names another number
+    near = climbs and 0 <= task.distance_m < clear_of_edge_m(robot)
+    if near and getattr(refusal, "number", "distance_m") == "distance_m":
         changes = {"distance_m": clear_of_edge_m(robot)}
     elif bound is None:
         changes = _milder(task, tried)

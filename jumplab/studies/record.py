@@ -305,8 +305,8 @@ class _Search:
                 break
 
     def from_easy(self) -> tuple[dict[str, float], Solved | None]:
-        """Results of all starts, and the best one; None if none of them led anywhere. Where that is
-        sought at once and no plan leads to it, they are climbed from.
+        """Results of all starts, and the best one; None if none of them led anywhere. If they have
+        plans, but none leads to a record at once, it is climbed to (:meth:`climbed`).
         """
         results: dict[str, float] = {}
         best: list[tuple] = []

@@ -89,28 +89,27 @@ class Body:
     @cached_property
     def unlocked(self) -> tuple[np.ndarray, np.ndarray]:
         """Angles (joints,) [rad] between which each joint of a leg, the others as in the stance,
-        leaves its foot all six ways to move: the determinant of its Jacobian stays above
-        :data:`LOCKED` of that in the stance. Infinite for knees, which have a range of their own,
-        and for joints that never lock their leg, as the hip's pitch does between axes of yaw and
-        roll.
+        leaves its foot all six ways to move: the determinant of the leg's Jacobian stays above
+        :data:`LOCKED` of that in the stance.
+
+        Infinite for joints that do not lock their leg (a hip's pitch between axes of yaw and roll
+        does, where the thigh is level), for knees, which have a range of their own, and for
+        :attr:`short` legs.
         """
         tree = self.robot.model
         data = tree.createData()
         low = np.full(tree.nv - BASE, -np.inf)
         high = -low
         q = stance_configuration(self.robot)
-        own = {k for k, _, _ in self.knees}
-        for foot, leg in zip(self.feet, self.legs, strict=True):
-            stops = self.motors.lower, self.motors.upper
-            for k in (column - BASE for column in leg if len(leg) == BASE):
-                angles = np.arange(stops[0][k], stops[1][k], LOCK_STEP_RAD)
+        for foot, leg, (knee, *_) in zip(self.feet, self.legs, self.knees, strict=True):
+            for k in (column - BASE for column in leg if not self.short):
+                angles = np.arange(self.motors.lower[k], self.motors.upper[k], LOCK_STEP_RAD)
                 moved = np.tile(q, (len(angles), 1))
                 moved[:, 7 + k] = angles
                 slopes = [pin.computeJointJacobian(tree, data, x, foot + 1)[:, leg] for x in moved]
                 ways = np.linalg.det(slopes)
-                stands = np.interp(q[7 + k], angles, ways)
-                locked = angles[ways / stands < LOCKED]
-                if k not in own and len(locked):
+                locked = angles[ways / np.interp(q[7 + k], angles, ways) < LOCKED]
+                if k != knee:
                     low[k] = max(locked[locked < q[7 + k]], default=-np.inf)
                     high[k] = min(locked[locked > q[7 + k]], default=np.inf)
         return low, high

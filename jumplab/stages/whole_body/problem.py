@@ -307,7 +307,7 @@ class Schedule:
             off = np.minimum(stance - motors.lower, motors.upper - stance)  # the nearer stop
             margin = np.maximum(margin, np.minimum(lim.rebound_range_rad, off / 2))
         low, high = self.body.ranges(margin, least, most)
-        if not free.plane:  # there, legs that lock move on
+        if not free.plane:  # in the plane no leg needs the way that it loses
             low = np.maximum(low, self.body.unlocked[0])
             high = np.minimum(high, self.body.unlocked[1])
         low, high = free.within(np.concatenate([-wide, low]), np.concatenate([wide, high]))
