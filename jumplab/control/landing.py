@@ -94,7 +94,7 @@ class LandingController:
     """Torques that catch and hold the robot; see the module's docstring.
 
     ``robot`` is as planned: the controller knows no perturbation. Without a
-    ``reference``, spring-dampers lead to the middle of the feet at standing height. ``solver``
+    ``reference``, spring-dampers lead to where the CoM stands above the feet. ``solver``
     counts the QPs posed and those without a solution. With ``may_step`` it takes a ``step``
     wherever its feet alone cannot catch the robot; what was planned ends there. Forces of the feet
     err by ``force_noise_n`` [N] each. ``gains`` are those of a robot of size one.
@@ -151,7 +151,8 @@ class LandingController:
         self._rest_push: np.ndarray | float = 0.0
         self._rest_pitch = float(robot.stance["trunk_pitch_rad"])
         gauge = Gauge(robot)
-        self._height = float(gauge.com(rest)[2])  # above the soles
+        # of the CoM from the middle of the soles, ahead and up
+        self._above = gauge.com(rest) - gauge.points(rest, robot.foot.center).mean(axis=0)
         self._leg_m = leg_length(robot)
         left, right = gauge.points(rest, robot.foot.center)[:, :2]
         self._apart_m = float(np.linalg.norm(left - right))
@@ -246,7 +247,9 @@ class LandingController:
         """Place, velocity and acceleration of the CoM, angular momentum and its rate, (3,) each, to
         which the robot is led.
         """
-        goal = foot_middle + np.array([0.0, 0.0, self._height])
+        ahead = np.append(self.body.trunk[:2, 0], 0.0)
+        goal = foot_middle + self._above[0] * ahead / np.linalg.norm(ahead)
+        goal[2] += self._above[2]
         speed, momentum, push, twist = np.zeros((4, 3))
         if self.reference is not None:
             com, speed[[0, 2]], momentum[1] = self.reference.at(time)

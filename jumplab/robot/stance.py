@@ -1,4 +1,6 @@
-"""Standing posture: soles flat on the ground, CoM above their middle, at rest."""
+"""Standing posture: soles flat on the ground, at rest, CoM above their middle, or nearer to the
+ankles where these are weak.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +13,38 @@ from jumplab.errors import RobotError
 from jumplab.robot.contact import on_feet, posed
 from jumplab.robot.files import LEG
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, TO_COMPLEX, in_xz
+from jumplab.task import GRAVITY
 
 if TYPE_CHECKING:  # a robot is checked by this before it is returned
     from jumplab.robot.description import Robot
 
 STANCE_ROOM_RAD = 0.04  # plans keep 0.03 off every stop
 SHANK_LEAN_RAD = (-0.6, 1.4)  # generous, both ways
+# of the ankles' torque that holds the CoM ahead of them: launches and landings need the rest
+ANKLE_SHARE = 0.4
 WIDTH_WEIGHT = 1e-3  # of the feet's distance in the neutral posture, which a robot keeps if it can
 # [m, rad] that a standing posture may miss: a leg of five joints whose sides differ
 STANDS_M = 1e-3
 CHANGE_STANCE = "change [stance] in its configuration"
 # [rad] knees and trunks of postures that are tried where the stance of a robot cannot be reached
 OTHER_STANCES = ((0.3, 0.0), (0.3, 0.2), (0.8, 0.05), (0.8, 0.25), (1.2, 0.1), (1.2, 0.3))
+
+
+def standing_ahead_m(robot: Robot) -> float:
+    """By how much the CoM stands ahead of the middle of the soles [m]: 0, but where ankles would
+    need more than :data:`ANKLE_SHARE` of their torque; then as near as that allows.
+    """
+    data = posed(robot.model)
+    feet = on_feet(robot, robot.foot.center)
+    sides = zip(feet, robot.joints["ankle_pitch"], strict=True)
+    ahead = []
+    for foot, name in sides:
+        ankle = data.oMi[robot.model.getJointId(name)].translation
+        ahead.append(foot.place(data).actInv(ankle)[0])
+    ankle_m = float(np.mean(ahead))
+    effort = sum(robot.actuators[name]["effort"] for name in robot.joints["ankle_pitch"])
+    way = ANKLE_SHARE * effort / (robot.total_mass * GRAVITY)
+    return float(np.clip(0.0, ankle_m - way, ankle_m + way))
 
 
 def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
@@ -35,7 +57,7 @@ def stance_angles(robot: Robot, *, within_limits: bool = True) -> np.ndarray:
     [rad].
 
     Knee, trunk pitch and shoulder come from the robot's configuration; the shank's lean follows
-    from the CoM above the middle of the sole. Raises
+    from the CoM above the middle of the sole (see :func:`standing_ahead_m`). Raises
     :class:`RobotError` if no lean does that, or, unless ``within_limits`` is off, if a joint would
     leave its range.
     """
@@ -60,7 +82,7 @@ def _joints(robot: Robot, angles: np.ndarray) -> zip:
 
 
 def _lean(robot: Robot, knee: float, trunk: float, arm: float) -> float:
-    """Lean of the shank [rad] with the CoM above the middle of the sole.
+    """Lean of the shank [rad] with the CoM where it stands, see :func:`standing_ahead_m`.
 
     Shank and thigh turn together, so the CoM's x is a wave in the lean: x = mean + size cos(lean -
     peak).
@@ -68,7 +90,7 @@ def _lean(robot: Robot, knee: float, trunk: float, arm: float) -> float:
     arms = robot.sagittal.mean_arms
     wave = arms[1] + arms[2] * np.exp(1j * knee)
     still = arms[0] + arms[3] * np.exp(-1j * trunk) + arms[4] * np.exp(-1j * arm)
-    mean = still.real - robot.sagittal.sole_center[0]
+    mean = still.real - robot.sagittal.sole_center[0] - standing_ahead_m(robot)
     turn = np.arccos(-mean / abs(wave)) if abs(mean) < abs(wave) else np.nan
     low, high = SHANK_LEAN_RAD
     leans = [(np.angle(wave) + x - low) % (2 * np.pi) + low for x in (-turn, turn)]
@@ -216,6 +238,7 @@ def standing(robot: Robot) -> np.ndarray:
     bends = knees(robot)
     knee = robot.stance["knee_rad"]
     trunk = robot.stance["trunk_pitch_rad"]
+    above = standing_ahead_m(robot)
     legs = np.unique([model.idx_qs[j] for a in feet for j in model.supports[a.joint] if j > 1])
 
     def soles(q: np.ndarray) -> list[pin.SE3]:
@@ -237,7 +260,7 @@ def standing(robot: Robot) -> np.ndarray:
         left, right = soles(q)
         (x1, y1, z1), (x2, y2, z2) = left.translation, right.translation
         tilts = [sole.rotation[[2, 2, 1], [0, 1, 0]] for sole in (left, right)]
-        ahead = pin.centerOfMass(model, data, q)[0]
+        ahead = pin.centerOfMass(model, data, q)[0] - above
         bent = np.mean([sign * q[7 + k] + angle for k, sign, angle in bends])
         width = WIDTH_WEIGHT * (y1 - y2 - wide)
         return np.concatenate([[ahead, bent - knee, x1, x2, z1, z2, y1 + y2], *tilts, [width]])

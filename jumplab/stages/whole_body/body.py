@@ -41,6 +41,7 @@ class Body:
     places : (2, 3) middles of the toe edges in the stance [m].
     legs : columns of the chart that follow from a foot that stands, see :func:`leg_columns`.
     ankle_m : height of the feet's joints in the stance [m].  half_m : half a sole's length [m].
+    ahead_m : by how much the CoM is ahead of the middle of the soles in the stance [m].
     """
 
     def __init__(self, robot: Robot):
@@ -63,7 +64,7 @@ class Body:
         configuration = stance_configuration(robot)
         self.stance = self.model.of_pinocchio(configuration[None])[0]
         data = robot.model.createData()
-        pin.forwardKinematics(robot.model, data, configuration)
+        self.ahead_m = float(pin.centerOfMass(robot.model, data, configuration)[0])
         self.places = np.array([x.place(data).translation for x in tips])
         self.ankle_m = float(data.oMi[tips[0].joint].translation[2])
 

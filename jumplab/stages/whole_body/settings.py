@@ -56,6 +56,8 @@ class Limits:
     # touchdown
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
+    # [rad/s] of its roll: sideways feet give less to catch it with
+    touchdown_roll_rate: float = 0.5
     touchdown_foot_rate: float = 0.3  # [rad/s] a foot that turns lands on an edge
     # [rad] the impact turns a straighter one too fast
     touchdown_knee: tuple[float, float] = (0.95, 1.4)
@@ -135,6 +137,7 @@ class Limits:
             body_clearance_m=0.06,
             momentum_share=0.15,  # stage 1's rod turns with other inertia than the body
             touchdown_trunk_rate=5.0,  # the trunk cannot stop while L stays what the turn needed
+            touchdown_roll_rate=5.0,
             touchdown_foot_rate=8.0,
             touchdown_waist_rad=0.5,  # it opens with the legs
             # an ankle at its stop cannot keep a tilted robot's soles flat

@@ -534,7 +534,8 @@ def touchdown_rows(m: Mode) -> list[Term]:
     angles = [free.free[k] - 3 for k in free.turns]
     # hips that hardly bend let a robot squat less than a landing should have
     bent = min(lim.touchdown_knee[0], m.body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
-    trunk = rates_within(m, lim.touchdown_trunk_rate, np.eye(3)[0][angles])
+    rates = lim.touchdown_trunk_rate, lim.touchdown_roll_rate, lim.touchdown_trunk_rate
+    trunk = rates_within(m, np.array(rates)[angles], np.eye(3)[0][angles])
     rate = lim.touchdown_joint_rate
     return [
         rise(),
@@ -594,9 +595,11 @@ def upright_waist(m: Mode) -> list[Term]:
     return [limit("waist at touchdown", "ours: stroke", "rad", "end", bent, -most, most)]
 
 
-def rates_within(m: Mode, rates: float, vertical: Sequence[float]) -> tuple[Callable, Callable]:
-    """Bounds on ``rates`` [rad/s] at touchdown; those about the ``vertical`` (n,) wider where more
-    than half a turn has to be stopped.
+def rates_within(
+    m: Mode, rates: float | np.ndarray, vertical: Sequence[float]
+) -> tuple[Callable, Callable]:
+    """Bounds on ``rates`` (n,) [rad/s] at touchdown; those about the ``vertical`` (n,) wider where
+    more than half a turn has to be stopped.
     """
 
     def most(parameters):
@@ -664,7 +667,7 @@ def capture_rows(m: Mode) -> list[Term]:
         return [flip_capture(m)]
 
     def capture(p):
-        ahead = p.turned([lim.capture_offset_m, 0.0, 0.0])
+        ahead = p.turned([lim.capture_offset_m - m.body.ahead_m, 0.0, 0.0])
         caught = p.sole_middle - p.com - ahead - lim.capture_slope_s * p.flight("vel")
         return caught[[k for k in m.free.places if k < 2]]
 
