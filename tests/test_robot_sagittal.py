@@ -140,6 +140,20 @@ def test_stance_follows_the_knee(bhr, knee):
     assert bhr.sagittal.joint_angles(angles)[1] == pytest.approx(knee)
 
 
+@pytest.mark.parametrize("effort", [6.0, 2.0, 60.0])
+def test_weak_ankles_hold_the_stance_with_a_share_of_their_torque(bhr, effort):
+    """The CoM stands above the middle of the soles, or nearer to the ankles: these then use two fifths."""
+    robot = bhr.with_limits(joints={"ankle_pitch": {"effort": effort}})
+    q, zero, weight = stance_configuration(robot), np.zeros(20), 42.0 * 9.8
+    com = pin.centerOfMass(robot.model, robot.model.createData(), q)[0]
+    left = inverse_dynamics(robot, q, zero, zero, (0.0, weight, -weight * com), (0.0, 0.0))
+    np.testing.assert_allclose(left[:6], 0, atol=1e-8)
+    needs = [abs(left[robot.model.idx_vs[robot.model.getJointId(x)]]) for x in robot.joints["ankle_pitch"]]
+    ahead = com + 0.02  # of the ankles: they are so far behind the middle of bhr's soles
+    assert ahead == pytest.approx(min(0.02, 0.4 * effort / (weight / 2)), abs=1e-9)
+    assert max(needs) <= 0.4 * effort  # a little less: the feet's own weight is not on them
+
+
 # axes ---------------------------------------------------------------------------------------------------------------
 def test_sides_that_share_no_angle_are_refused(bhr):
     head, tail = bhr.urdf.split('<joint name="right_knee"')

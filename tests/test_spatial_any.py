@@ -259,7 +259,7 @@ def test_what_cannot_hold_its_own_weight_is_refused_before_any_solve(robot):
         assert given.success and np.max(np.abs(weight[6:] - pushes[6:] @ given.x) / effort) >= share - 1e-9
     weak = robot.with_limits(effort=0.9 * share)
     with pytest.raises(
-        InfeasibleError, match=r"^robot wide cannot hold the posture in which it begins: .* needs 1\.1 times its"
+        InfeasibleError, match=r"^robot wide cannot hold the posture in which it begins: .* needs 1\.\d times its"
     ):
         jl.Planner(weak).plan(jl.JumpTask(0.3, 0.2))
 

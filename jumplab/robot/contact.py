@@ -13,6 +13,7 @@ import pinocchio as pin
 if TYPE_CHECKING:
     from jumplab.robot.description import Robot
 
+FRICTION = 0.42  # of plans: below the lowest that trials have, so that it holds between the nodes
 WAYS = (("+x", 0, 1.0), ("-x", 0, -1.0), ("+y", 1, 1.0), ("-y", 1, -1.0))
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 

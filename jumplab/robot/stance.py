@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import RobotError
-from jumplab.robot.contact import on_feet, posed
+from jumplab.errors import InfeasibleError, RobotError
+from jumplab.robot.contact import FRICTION, on_feet, posed
 from jumplab.robot.files import LEG
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, TO_COMPLEX, in_xz
 from jumplab.task import GRAVITY
@@ -22,6 +22,7 @@ STANCE_ROOM_RAD = 0.04  # plans keep 0.03 off every stop
 SHANK_LEAN_RAD = (-0.6, 1.4)  # generous, both ways
 # of the ankles' torque that holds the CoM ahead of them: launches and landings need the rest
 ANKLE_SHARE = 0.4
+WITHIN_SHARE = 0.7  # of half the sole, from its middle, within which the CoM stands anyway
 WIDTH_WEIGHT = 1e-3  # of the feet's distance in the neutral posture, which a robot keeps if it can
 # [m, rad] that a standing posture may miss: a leg of five joints whose sides differ
 STANDS_M = 1e-3
@@ -32,7 +33,7 @@ OTHER_STANCES = ((0.3, 0.0), (0.3, 0.2), (0.8, 0.05), (0.8, 0.25), (1.2, 0.1), (
 
 def standing_ahead_m(robot: Robot) -> float:
     """By how much the CoM stands ahead of the middle of the soles [m]: 0, but where ankles would
-    need more than :data:`ANKLE_SHARE` of their torque; then as near as that allows.
+    need more than :data:`ANKLE_SHARE` of their torque; then as near to it as that allows.
     """
     data = posed(robot.model)
     feet = on_feet(robot, robot.foot.center)
@@ -44,7 +45,8 @@ def standing_ahead_m(robot: Robot) -> float:
     ankle_m = float(np.mean(ahead))
     effort = sum(robot.actuators[name]["effort"] for name in robot.joints["ankle_pitch"])
     way = ANKLE_SHARE * effort / (robot.total_mass * GRAVITY)
-    return float(np.clip(0.0, ankle_m - way, ankle_m + way))
+    inside = WITHIN_SHARE * (robot.foot.toe - robot.foot.heel) / 2
+    return float(np.clip(np.clip(0.0, ankle_m - way, ankle_m + way), -inside, inside))
 
 
 def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
@@ -310,3 +312,17 @@ def holding(robot: Robot, q: np.ndarray, friction: float) -> tuple[float, str, f
     torque = weight[6:] - pushed[6:] @ solved.x[:-1]
     most = int(np.argmax(np.abs(torque) / effort))
     return float(solved.x[-1]), robot.joint_names[most], float(abs(torque[most]))
+
+
+def check_held(robot: Robot, q: np.ndarray, friction: float = FRICTION) -> None:
+    """Refuse (:class:`InfeasibleError`) a robot whose joints cannot hold a posture ``q`` (nq,), see
+    :func:`holding`.
+    """
+    share, joint, torque = holding(robot, q, friction) or (0.0, "", 0.0)
+    if share > 1:
+        raise InfeasibleError(
+            f"robot {robot.name} cannot hold the posture in which it begins: however the ground's "
+            f"forces are shared, joint {joint} needs {share:.1f} times its effort, "
+            f"{torque:.3g} N m of {robot.actuators[joint]['effort']:.3g}; if these are motors' "
+            f"efforts before their gears, give those of the joints in [limits]"
+        )

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from jumplab.errors import RobotError, quoted
+from jumplab.errors import InfeasibleError, RobotError, quoted
 from jumplab.robot.contact import posed
 from jumplab.robot.description import Robot
 from jumplab.robot.files import files_of, read_toml, roles_table
-from jumplab.robot.stance import check_stance, stance_configuration
+from jumplab.robot.stance import check_held, check_stance, stance_configuration
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.jumper import REPAIRS, make_jumper, source_of
 from jumplab.robot_import.lump import Lumped
@@ -100,6 +100,10 @@ def check(path: str | Path, config_text: str, tree: Tree | None = None) -> Check
     tree = tree or urdf_checks.read_tree(read_urdf(path), path.name, path, repair)
     result = Checkup(*make_jumper(tree, config), tree)
     check_stance(result.robot)
+    try:
+        check_held(result.robot, stance_configuration(result.robot))
+    except InfeasibleError as e:
+        raise RobotError(str(e)) from None
     return result
 
 

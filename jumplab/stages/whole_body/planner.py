@@ -17,7 +17,7 @@ from jumplab.ocp.cache import in_turn
 from jumplab.ocp.nlp import EXPLAINED, Nlp, left_s, unexplained
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import Robot
-from jumplab.robot.stance import holding
+from jumplab.robot.stance import check_held
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.between import shares_between
@@ -331,16 +331,7 @@ class WholeBodyPlanner:
             return
         chart = self.body.stance if stance is None else stance
         q = configurations(self.body.model, chart[None])[0]
-        robot = self.robot.under_gravity(task.gravity)
-        share, joint, torque = holding(robot, q, self.limits.friction) or (0.0, "", 0.0)
-        if share > 1:
-            effort = self.robot.actuators[joint]["effort"]
-            raise InfeasibleError(
-                f"robot {self.robot.name} cannot hold the posture in which it begins: however the "
-                f"ground's forces are shared, joint {joint} needs {share:.1f} times its effort, "
-                f"{torque:.3g} N m of {effort:.3g}; if these are motors' efforts before their "
-                f"gears, give those of the joints in [limits]"
-            )
+        check_held(self.robot.under_gravity(task.gravity), q, self.limits.friction)
 
 
 def _farthest(failures: Sequence[JumplabError]) -> JumplabError:

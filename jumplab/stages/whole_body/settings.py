@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jumplab.errors import InputError, quoted
+from jumplab.robot.contact import FRICTION
 from jumplab.robot.legs import Size
 
 # of the flight, at its end: by then a flip has folded; the hardest push of an opening comes in the
@@ -22,8 +23,7 @@ class Limits:
     torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
     speed_share: float = 0.90  # of the speed limit
     power_share: float = 0.95  # of what all motors may draw: between the nodes they draw more
-    # below the lowest friction that trials have (0.5), so that it holds between the nodes too
-    friction: float = 0.42
+    friction: float = FRICTION
     range_margin_rad: float = 0.03  # to the joint stops
     # ahead of the heel; at the toe none, it ends there before the heel rises
     cop_margin_m: float = 0.01
@@ -55,9 +55,9 @@ class Limits:
     ankle_margin_m: float = 0.005
     # touchdown
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
-    touchdown_trunk_rate: float = 1.0  # [rad/s]
-    # [rad/s] of its roll: sideways feet give less to catch it with
-    touchdown_roll_rate: float = 0.5
+    touchdown_trunk_rate: float = 1.0  # [rad/s] of its pitch
+    # [rad/s] of its yaw and its roll, which feet can do less against
+    touchdown_side_rate: float = 0.5
     touchdown_foot_rate: float = 0.3  # [rad/s] a foot that turns lands on an edge
     # [rad] the impact turns a straighter one too fast
     touchdown_knee: tuple[float, float] = (0.95, 1.4)
@@ -137,7 +137,7 @@ class Limits:
             body_clearance_m=0.06,
             momentum_share=0.15,  # stage 1's rod turns with other inertia than the body
             touchdown_trunk_rate=5.0,  # the trunk cannot stop while L stays what the turn needed
-            touchdown_roll_rate=5.0,
+            touchdown_side_rate=5.0,
             touchdown_foot_rate=8.0,
             touchdown_waist_rad=0.5,  # it opens with the legs
             # an ankle at its stop cannot keep a tilted robot's soles flat

@@ -534,7 +534,7 @@ def touchdown_rows(m: Mode) -> list[Term]:
     angles = [free.free[k] - 3 for k in free.turns]
     # hips that hardly bend let a robot squat less than a landing should have
     bent = min(lim.touchdown_knee[0], m.body.squat_rad - SQUAT_ROOM_RAD), lim.touchdown_knee[1]
-    rates = lim.touchdown_trunk_rate, lim.touchdown_roll_rate, lim.touchdown_trunk_rate
+    rates = lim.touchdown_side_rate, lim.touchdown_side_rate, lim.touchdown_trunk_rate
     trunk = rates_within(m, np.array(rates)[angles], np.eye(3)[0][angles])
     rate = lim.touchdown_joint_rate
     return [
