@@ -27,6 +27,7 @@ from jumplab.ocp.nlp import EXPLAINED
 from jumplab.robot.description import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.robot_import.checkup import examine, first_look
+from jumplab.sim import INSTALLED
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import METHODS, Planner
 from jumplab.stages.srmp import SrmpSettings
@@ -83,7 +84,9 @@ def leg_m(robot: Robot) -> float:
 
 
 def jumped(path: Path, size: float = 1.0) -> dict[str, Any]:
-    """One jump of the target's shares, planned, audited and played in MuJoCo, in the first mode that lands."""
+    """One jump of the target's shares, planned, audited and played in both engines, in the first mode that lands in
+    both.
+    """
     robot = examine(path).robot
     distance, rise = (round(size * share * leg_m(robot), 3) for share in SHARES)
     rise = max(rise, LEAST_M)
@@ -93,13 +96,14 @@ def jumped(path: Path, size: float = 1.0) -> dict[str, Any]:
         failed = [check.name for check in api.audit(plan).checks if not check.passed]
         row |= {"clean": not failed, "reason": ", ".join(failed)}
         for mode in SERVOS:  # a leg that passes a straight line of two axes is not held by angles alone
-            result = api.simulate(plan, engine="mujoco", mode=mode)
-            row |= {"landed": result.landed, "mode": mode}
-            if result.landed:
+            runs = [api.simulate(plan, engine=engine, mode=mode) for engine in INSTALLED]
+            row |= {"landed": all(run.landed for run in runs), "mode": mode}
+            if row["landed"]:
                 break
-        row["reason"] = row["reason"] or result.reason
-        if result.metrics.foot_distance_m is not None:  # it touched down
-            row["simulated_m"] = round(result.metrics.foot_distance_m, 3)
+        worst = min(runs, key=lambda run: run.landed)
+        row["reason"] = row["reason"] or worst.reason
+        if worst.metrics.foot_distance_m is not None:  # it touched down
+            row["simulated_m"] = round(worst.metrics.foot_distance_m, 3)
     except JumplabError as e:
         row["reason"] = str(e)
     return row
