@@ -102,6 +102,21 @@ def test_a_robot_without_such_numbers_is_as_ever(bhr):
     assert np.array_equal(bhr.limits.no_load_speed, bhr.limits.speed) and not any(bhr.motors.values())
 
 
+def test_rotors_by_estimate(bhr):
+    """Peak torque^1.5 gives the G1's three motors within a third; what has an armature keeps it."""
+    heavier = bhr.with_rotors(2.0)
+    for name, x in heavier.actuators.items():
+        assert x["armature"] == pytest.approx(2 * 2.2e-5 * x["effort"] ** 1.5, rel=1e-3)
+        assert heavier.model.armature[heavier.model.idx_vs[heavier.model.getJointId(name)]] == x["armature"]
+    for effort, armature in ((111.0, 0.0251), (71.0, 0.01018), (24.8, 0.00361)):  # as its maker publishes them
+        assert 0.75 < 2.2e-5 * effort**1.5 / armature < 1.34
+    again = replace(bhr, config_text=f'{bhr.config_text}\narmature = {{left_knee = 0.5}}').with_rotors()
+    assert (again.actuators["left_knee"]["armature"], again.actuators["right_knee"]["armature"]) == (0.5, 0.06695)
+    known = "robot bhr: the armature of all its motors is known; leave out with_rotors"
+    assert refused(heavier.with_rotors, by=RobotError) == known
+    assert refused(bhr.with_rotors, 0, by=RobotError) == "robot bhr: the factor on rotors must be a positive number, got 0"
+
+
 @pytest.mark.parametrize("told, sentence", [
     ("armature = -0.1\n", "armature = -0.1 must not be negative"),
     ("friction = -1.0\n", "friction = -1 must not be negative"),

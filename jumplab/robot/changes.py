@@ -25,6 +25,9 @@ MOST = 1e9  # factor or number of a changed robot
 UNITS = {"effort": "N m", "speed": "rad/s", "lower": "rad", "upper": "rad"}
 ENDS = {"lower": "upper", "upper": "lower"}  # of a range, and the other one
 GEARED = {"armature": 2, "friction": 1, "damping": 2}  # powers of a gear's ratio that they go with
+# [kg m^2 / (N m)^1.5] armature over peak torque^1.5: by gears alone it grows with the square of the
+# torque, with larger motors more slowly; the G1's three motors give 1.7e-5 to 2.9e-5
+ROTORS = 2.2e-5, 1.5
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -157,6 +160,23 @@ def gears(robot: Robot, ratios: Mapping) -> str:
                 if lost := robot.actuators[name][what]:
                     rows = config["actuators"].setdefault(what, {})
                     rows[name] = float(f"{lost * ratio**power:.12g}")
+    return tomlkit.dumps(config)
+
+
+def rotors(robot: Robot, factor: float) -> str:
+    """The TOML with an estimated armature, ``factor`` [1] times :data:`ROTORS`, of motors that have
+    none.
+
+    Raises :class:`RobotError` as :meth:`.Robot.with_rotors` says.
+    """
+    scale, power = ROTORS
+    factor = _number(robot, "the factor on rotors", factor)
+    config = tomlkit.parse(robot.config_text)
+    without = {name: x["effort"] for name, x in robot.actuators.items() if not x["armature"]}
+    if not without:
+        raise robot.error("the armature of all its motors is known; leave out with_rotors")
+    rows = config["actuators"].setdefault("armature", {})
+    rows |= {name: float(f"{factor * scale * x**power:.4g}") for name, x in without.items()}
     return tomlkit.dumps(config)
 
 

@@ -316,6 +316,15 @@ class Robot(Shown):
         slower = {key: 1 / ratio for key, ratio in ratios.items()}
         return geared.with_limits(effort=ratios, speed=slower)
 
+    def with_rotors(self, factor: float = 1.0) -> Robot:
+        """Another robot, whose motors have rotors where its files give none: an estimate from their
+        peak torque (2.2e-5 kg m^2 of armature per (N m)^1.5, which is the G1's within a third),
+        ``factor`` [1] times as large.
+
+        Raises :class:`RobotError` for a number that is no factor, and if all motors have rotors.
+        """
+        return replace(self, config_text=changes.rotors(self, factor))
+
     def with_legs(self, factor: float = 1.0, *, thigh: float = 1.0, shank: float = 1.0) -> Robot:
         """Another robot, whose thighs and shanks are ``factor`` [1] times as long, or each by a
         factor of its own besides, and weigh the same. The URDF gets the new numbers, the TOML a
