@@ -114,7 +114,8 @@ def test_rotors_by_estimate(bhr):
     assert (again.actuators["left_knee"]["armature"], again.actuators["right_knee"]["armature"]) == (0.5, 0.06695)
     known = "robot bhr: the armature of all its motors is known; leave out with_rotors"
     assert refused(heavier.with_rotors, by=RobotError) == known
-    assert refused(bhr.with_rotors, 0, by=RobotError) == "robot bhr: the factor on rotors must be a positive number, got 0"
+    no_factor = "robot bhr: the factor on rotors must be a positive number, got 0"
+    assert refused(bhr.with_rotors, 0, by=RobotError) == no_factor
 
 
 @pytest.mark.parametrize("told, sentence", [

@@ -1,8 +1,7 @@
 """Published humanoids, each imported without a flag, planned and simulated once: the rows of ``humanoids.json``.
 
-``python -m paper.humanoids FOLDER [--jump] [--bounds]`` in the folder of the notebooks looks for FOLDER/NAME/FILE of
-every row, and writes what became of it; ``--jump`` also plans and simulates what has not been yet, ``--bounds`` looks
-for the highest jump on the spot of those that are planned in the plane. Notebook 07 draws the file.
+``python -m paper.humanoids FOLDER [--jump]`` in the folder of the notebooks looks for FOLDER/NAME/FILE of every row,
+and writes what became of it; ``--jump`` also plans and simulates what has not been yet. Notebook 07 draws the file.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,15 +21,10 @@ import pinocchio as pin
 from jumplab import api
 from jumplab.control.servo import SERVOS
 from jumplab.errors import JumplabError
-from jumplab.ocp.nlp import EXPLAINED
 from jumplab.robot.description import Robot
-from jumplab.robot.reach import Reach, reach
 from jumplab.robot_import.checkup import examine, first_look
 from jumplab.sim import INSTALLED
-from jumplab.stages.plan import JumpPlan
-from jumplab.stages.planner import METHODS, Planner
-from jumplab.stages.srmp import SrmpSettings
-from jumplab.task import GRAVITY, MAX_HEIGHT_M, JumpTask
+from jumplab.task import JumpTask
 from paper import logs
 
 TABLE = Path(__file__).with_name("humanoids.json")
@@ -39,19 +32,12 @@ LEG = ("hip_pitch", "knee", "ankle_pitch")
 SHARES = (0.38, 0.19)  # distance and rise, of the leg's length from hip to ankle
 SMALLER = (0.5, 0.25)  # of both, where the whole jump has no clean plan or does not land
 LEAST_M = 0.02  # of a rise that can be asked for
-STEP = 1.15  # between the rises that are tried
-AHEAD = 0.5, 1.0, 2.0  # rises; jumps so far ahead are tried as a beginning of one on the spot
 PLAN_S = 300.0  # longest processor time for one plan with its audit and simulation
-LADDER_S = 1800.0  # and for all plans of a ladder
 
 
 def rows() -> list[dict[str, Any]]:
     """The table: name, repository, file, the legs' joints as a person read them, and what became of the robot."""
     return logs.table(TABLE)
-
-
-# [1] the rod's swing adds to a straight push; stage 1 was seen up to 5.6 % beyond it
-SWING_GAIN = 1.06
 
 
 def imported(path: Path, legs: list[list[str]]) -> tuple[Robot | None, dict[str, Any]]:
@@ -123,75 +109,6 @@ def largest(path: Path, first: dict[str, Any] | None) -> dict[str, Any]:
     return first | {"smaller": "neither"}
 
 
-def straight_push(envelope: Reach) -> float:
-    """CoM rise [m] by a straight push of the legs, m v dv = (F(phi, v) - m g) dphi from rest in the deepest crouch."""
-    s = SrmpSettings()
-    phi = np.linspace(envelope.length[0], min(s.takeoff_length * envelope.start[1], envelope.length[1]), 200)
-    force, speed = (np.polyval(fit, phi) for fit in (envelope.force_fit, envelope.speed_fit))
-    square, best, stroke = 0.0, 0.0, phi[-1] - phi[0]
-    for f, v, step in zip(force[1:], speed[1:], np.diff(phi), strict=True):
-        fade = np.clip((v - np.sqrt(square)) / ((1 - s.corner_speed) * v), 0.0, 1.0)
-        square = max(square + 2 * step * (f * fade / envelope.mass - GRAVITY), 0.0)
-        best = max(best, min(np.sqrt(square), s.speed_share * v))
-    by_force = stroke * (force.mean() / (envelope.mass * GRAVITY) - 1)
-    return float(max(min((SWING_GAIN * best) ** 2 / (2 * GRAVITY), by_force), 0.0))
-
-
-def bounded(path: Path) -> dict[str, Any]:
-    """Greatest rise of a robot on the spot for which a plan is found, on a ladder of rises :data:`STEP` apart.
-
-    From above what a straight push may give, the ladder is gone down to the first rung with a clean plan by either
-    method, and from there up again, each plan begun with the one below or with a jump ahead. ``refused`` has the
-    reasons, by method, why there is none on the rung above.
-    """
-    EXPLAINED.set(False)  # nobody reads why
-    planner = Planner(examine(path).robot)
-    push = straight_push(reach(planner.robot))
-    rungs = [round(push * STEP**power, 4) for power in range(-8, 7)]
-    rungs = [rise for rise in rungs if LEAST_M <= rise <= MAX_HEIGHT_M]
-    level, plan, refused = len(rungs), None, {}
-    while level and plan is None:
-        level -= 1
-        plan, refused[level] = _tried({m: partial(planner.plan, _up(rungs[level]), m) for m in METHODS})
-    if plan is None:
-        return {"push_m": round(push, 4), "rise_m": None, "above_m": rungs[0], "refused": refused[0]}
-    while level + 1 < len(rungs):
-        task = _up(rungs[level + 1])
-        ways = {"begun with the plan below": partial(planner.replan, plan, task)}
-        ways |= {f"begun with {x:g} times the rise ahead": partial(_eased, planner, task, x) for x in AHEAD}
-        higher, beside = _tried(ways)
-        if higher is None:
-            break
-        level, plan = level + 1, higher
-    above, why = (rungs[level + 1], refused[level + 1] | beside) if level + 1 < len(rungs) else (None, {})
-    return {"push_m": round(push, 4), "rise_m": rungs[level], "above_m": above, "refused": why}
-
-
-def _eased(planner: Planner, task: JumpTask, share: float) -> JumpPlan:
-    """A jump on the spot, begun with one ``share`` times its rise ahead."""
-    return planner.replan(planner.plan(replace(task, distance_m=share * task.height_m), "direct"), task)
-
-
-def _up(rise_m: float) -> JumpTask:
-    return JumpTask(0.0, rise_m)
-
-
-def _tried(ways: dict[str, Callable[[], Any]]) -> tuple[Any, dict[str, str]]:
-    """The first plan that is clean, and nothing else; or None and by way why there is none."""
-    reasons = {}
-    for name, way in ways.items():
-        try:
-            plan = way()
-        except JumplabError as e:
-            reasons[name] = str(e)
-            continue
-        failed = api.audit(plan).failed
-        if not failed:
-            return plan, {}
-        reasons[name] = ", ".join(check.name for check in failed)
-    return None, reasons
-
-
 def within_time(work_on: Callable[[Path], dict[str, Any]], path: Path, longest_s: float = PLAN_S) -> dict[str, Any]:
     """Result of ``work_on`` in a process of its own, given up after ``longest_s`` [s] of processor time."""
     limit = resource.RLIMIT_CPU, (int(longest_s), int(longest_s))
@@ -203,16 +120,6 @@ def within_time(work_on: Callable[[Path], dict[str, Any]], path: Path, longest_s
             return {"clean": None, "landed": None, "reason": f"no plan within {longest_s:g} s of one core"}
         except Exception as e:  # an internal error is a result as well: the aim is none
             return {"clean": None, "landed": None, "reason": f"internal error: {type(e).__name__}: {e}"}
-
-
-def heights(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row per robot whose highest jump on the spot was looked for: that, and where no method found one."""
-    found = [(row["name"], row["highest"]) for row in table if "rise_m" in row.get("highest", {})]
-    words = "straight push [m]", "highest clean plan [m]", "no clean plan found at [m]"
-    return [
-        {"robot": name, **dict(zip(words, (h[k] for k in ("push_m", "rise_m", "above_m")), strict=True))}
-        for name, h in found
-    ]
 
 
 def verdicts(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -238,11 +145,7 @@ def main(folder: str, *options: str) -> None:
         row["import"] = told
         if robot is not None and "--jump" in options:
             row["jump"] = largest(path, row.get("jump"))
-        if robot is not None and robot.planar and "--bounds" in options and "highest" not in row:
-            row["highest"] = within_time(bounded, path, LADDER_S)
-        print(
-            row["name"], told["legs right"], told["faults"][:1], row.get("jump", ""), row.get("highest", ""), flush=True
-        )
+        print(row["name"], told["legs right"], told["faults"][:1], row.get("jump", ""), flush=True)
         logs.write_table(TABLE, table)
 
 
