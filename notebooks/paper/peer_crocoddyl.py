@@ -1,7 +1,8 @@
 """The same jump by crocoddyl, which knows multiple shooting and DDP and no hard limits: time and quality of its answer.
 
 Crocoddyl needs another Pinocchio than this package, so it runs in an environment of its own:
-``pip install crocoddyl==3.2.1 pin==4.0.0``, then ``python peer_crocoddyl.py OUT.json DIR...`` with folders of plans.
+``pip install crocoddyl==3.2.1 pin==4.0.0``, then ``python peer_crocoddyl.py OUT.json DIR...`` with folders of plans
+(``jumplab plan ... --out DIR``), some of each jump: their times are repeats.
 The durations of launch and flight are the plan's, with flat feet; what the plan has as limits are barriers here, and
 motors have neither a torque-speed line nor rotors. It moves a floating base with all joints of the robot, also where
 the plan is of links in the plane or of one half of an even robot.
@@ -74,7 +75,8 @@ class Jump:
             add("rise", crocoddyl.ResidualModelCentroidalMomentum(state, momentum, nu), RISE, vertical)
         if last:
             for k, foot in enumerate(self.feet):
-                goal = pin.SE3(np.eye(3), self.places[k].translation + np.array([target["distance_m"], 0.0, 0.0]))
+                way = np.array([target["distance_m"], target["side_m"], 0.0])
+                goal = pin.SE3(np.eye(3), self.places[k].translation + way)
                 add(f"touchdown {k}", crocoddyl.ResidualModelFramePlacement(state, foot, goal, nu), PLACE)
             return found
         add("effort", crocoddyl.ResidualModelControl(state, nu), EFFORT)
@@ -139,24 +141,32 @@ def solved(jump: Jump) -> dict[str, Any]:
     n, xs = round(jump.told["launch_s"] / jump.step_s), np.array(solver.xs)
     q, v = xs[:, : jump.model.nq], xs[:, jump.model.nq :]
     row = {"method": f"crocoddyl {crocoddyl.__version__}, {1e3 * jump.step_s:g} ms", "nodes": len(xs), "cpu_s": spent}
+    row["cpu_most_s"] = max(row[0] for row in found)
     row |= {"near_cpu_s": spent * near / solver.iter, "iterations": int(solver.iter), "converged": bool(done)}
     return row | jump.measured(q, v, np.array(solver.us), n, np.full(len(solver.us), jump.step_s))
 
 
-def compared(folder: Path) -> list[dict[str, Any]]:
-    """Rows of the plan of a folder, and of crocoddyl's answers with each step."""
+def compared(folders: list[Path]) -> list[dict[str, Any]]:
+    """Rows of the plans of one jump, of the one in the middle by time, and of crocoddyl's answers with each step."""
+    spent = {folder: sum(row["solve_s"] for row in Jump(folder, STEPS_S[0]).told["stages"]) for folder in folders}
+    folder = sorted(folders, key=spent.get)[len(folders) // 2]
     jump, tape = Jump(folder, STEPS_S[0]), np.load(folder / "plan.npz")
-    solves, n = [row["solve_s"] for row in jump.told["stages"]], int(np.argmax(tape["phase"] == "flight"))
-    ours = {"method": "direct", "nodes": None, "cpu_s": sum(solves), "near_cpu_s": sum(solves)}
-    ours |= {"iterations": sum(row["iterations"] for row in jump.told["stages"]), "converged": True}
+    n = int(np.argmax(tape["phase"] == "flight"))
+    ours = {"method": "direct", "nodes": None, "cpu_s": spent[folder], "cpu_most_s": max(spent.values())}
+    ours |= {"near_cpu_s": spent[folder], "converged": True}
+    ours["iterations"] = sum(row["iterations"] for row in jump.told["stages"])
     ours |= jump.measured(tape["q"], tape["v"], tape["tau"][:-1], n, np.diff(tape["t"]))
     head = {"robot": jump.told["robot"]["name"], "target": jump.told["target"]}
     return [head | row for row in (ours, *(solved(Jump(folder, step_s)) for step_s in STEPS_S))]
 
 
 def main(out: Path, folders: list[Path]) -> None:
-    """Solve the jump of each folder with each step, and put its plan beside."""
-    rows = [row for folder in folders for row in compared(folder)]
+    """Solve each jump with each step, and put its plans beside."""
+    jumps: dict[str, list[Path]] = {}
+    for folder in folders:
+        told = json.loads((folder / "summary.json").read_text())
+        jumps.setdefault(json.dumps([told["robot"]["name"], told["target"]]), []).append(folder)
+    rows = [row for some in jumps.values() for row in compared(some)]
     out.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     print(json.dumps(rows, indent=1))
 
