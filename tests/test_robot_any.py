@@ -26,6 +26,7 @@ from fixtures_robots import (
 )
 
 from jumplab.auditing.audit import audit
+from jumplab.errors import RobotError
 from jumplab.robot import Robot
 from jumplab.robot.files import read_toml
 from jumplab.robot.stance import stance_angles
@@ -127,6 +128,41 @@ def stiff_child() -> tuple[str, str]:
     """Six tenths of the size, no ankle roll, arms held."""
     urdf = re.sub(r'(_ankle_roll" type=)"revolute"', r'\1"fixed"', child()[0])
     return urdf, config("stiff_child", 0.6, shoulders="[]")
+
+
+def weak(role: str, effort: float, name: str = "weak", **values) -> tuple[str, str]:
+    """Little torque in one role, on other soles."""
+    robot = root()
+    for side in ("left", "right"):
+        joint(robot, f"{side}_{role}").find("limit").set("effort", str(effort))
+    return text(robot), config(name, **values)
+
+
+def long_toes() -> tuple[str, str]:
+    """Ankles that would need 97 % of their torque to hold the CoM above the middle of the soles."""
+    return weak("ankle_pitch", 17.0, "long_toes", heel=-0.04, toe=0.2)
+
+
+def test_motors_that_cannot_hold_the_stance_are_refused_with_the_file(tmp_path):
+    """Ankles are spared by where the CoM stands; knees whose effort is that of a motor before its gear are not."""
+    with pytest.raises(RobotError) as refusal:
+        load(tmp_path, weak, "knee", 9.0)
+    assert re.fullmatch(
+        r"robot weak cannot hold the posture in which it begins: however the ground's forces are shared, joint "
+        r"(left|right)_knee needs \d\.\d times its effort, [\d.]+ N m of 9; if these are motors' efforts before their "
+        r"gears, give those of the joints in \[limits\]",
+        str(refusal.value),
+    )
+    load(tmp_path, weak, "ankle_pitch", 3.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_weak_ankles_jump_and_stand(tmp_path, engine):
+    robot = load(tmp_path, long_toes)
+    plan = Planner(robot).plan(JumpTask(0.2, 0.1))
+    assert audit(plan.tape, plan.robot, plan.task).passed
+    assert simulate_jump(plan.tape, robot, engine=engine).landed
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ class LandingSettings:
     # [1 / (N m)^2 / s]; a quarter of the launch's, L must be gone soon
     w_momentum_rate: float = 5e-4
     w_acceleration: float = 2e-2  # [1 / (m/s^2)^2 / s] of the CoM: an even push, peak force low
-    # [1 / m^2 / s] distance from the middle of the sole: a margin for the controller
+    # [1 / m^2 / s] of the CoP from its place at rest: a margin for the controller
     w_cop: float = 20.0
     # [1 / rad^2 / s] trunk against its pitch in the stance; ties L to the trunk's way back
     w_posture: float = 50.0
@@ -162,8 +162,11 @@ def landing_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term
         speed = ca.polyval(ca.DM(envelope.speed_fit), p.q[1])
         return ca.vertcat(speed - p.v[1], speed + p.v[1])
 
+    lean, length, *_ = envelope.start
+    ahead = length * np.sin(lean)
+
     def cop(p):
-        return -p.pivot_torque / (mass * p.p.gravity)
+        return -p.pivot_torque / (mass * p.p.gravity) - ahead
 
     def lean(p):
         return p.posture - upright
@@ -184,7 +187,7 @@ def landing_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term
             "com_acceleration",
             s.w_acceleration,
         ),
-        Term("CoP from the middle", "ours, times F_z / m g", "m", "node", cop, s.w_cop),
+        Term("CoP from its place at rest", "ours, times F_z / m g", "m", "node", cop, s.w_cop),
         Term("trunk upright", "ours", "rad", "node", lean, s.w_posture),
         Term("landing time", "ours", "s", "end", "duration", s.w_time),
         limit("leg speed", "ours: from the joint speeds", "m/s", "node", room, skip=(1, 0)),
@@ -205,7 +208,8 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
         return lambda parameters: np.array([*parameters["rates"], sign * free, sign * free])
 
     low, high = zip(settings.lean_rad, envelope.length, base.turn_rad, base.radius_m, strict=True)
-    first, last = ([0.0, envelope.start[1], turn, envelope.start[3]] for turn in (-free, free))
+    lean, length, _, radius = envelope.start
+    first, last = ([lean, length, turn, radius] for turn in (-free, free))
     still = np.array([0.0, 0.0, free, 0.0])  # turning is what L at rest stops
     bounds = (
         Bound("touchdown", "flight's end", "rad, m", "q", start, start, "start"),
