@@ -12,9 +12,9 @@ from jumplab.robot.stance import stance_angles
 # descriptions that are no robot ---------------------------------------------------------------------------------
 def test_unknown_robot(tmp_path):
     with pytest.raises(RobotError) as e:
-        Robot.load("atlas")
+        Robot.load("asimo")
     known = ", ".join(SHIPPED)
-    assert str(e.value) == f"robot 'atlas': neither a shipped robot ({known}) nor a readable TOML file"
+    assert str(e.value) == f"robot 'asimo': neither a shipped robot ({known}) nor a readable TOML file"
     assert e.value.exit_code == 2
     for name in (str(tmp_path), "", "a\0b", "x" * 5000):
         with pytest.raises(RobotError, match=r"neither a shipped robot \(bhr, .*\) nor a readable TOML file$"):

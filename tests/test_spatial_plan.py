@@ -677,6 +677,11 @@ def test_links_that_meet_are_kept_where_they_were(bhr, pitch, roll, links, axis)
     kept = unpassed(program, Asked(SIDE), [replace(x, more_m=MORE_M) for x in rows]).apart
     ends = [(x.first, x.last, x.more_m) for x in kept]
     assert ends == [(x.first, x.last, 0.0) for x in rows]
+    # two meetings that began at one face are one row, whichever faces lead out of them
+    x, turned = rows[0], replace(rows[0].pair, face=(rows[0].pair.face + 2) % 6)
+    later = replace(x, pair=turned, first=x.last + 1, last=x.last + 3)
+    (both,) = unpassed(program, Asked(SIDE), [x, later]).apart
+    assert (both.first, both.last, both.pair) == (x.first, x.last + 3, x.before)
     at = {box.name: k for k, box in enumerate(body.shapes)}
     boxes = placed(body, body.model.to_pinocchio(q, still, still)[0])
     for x in kept:

@@ -154,6 +154,17 @@ def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:
     return tuple(out.values())
 
 
+def as_before(rows: Sequence[Apart]) -> tuple[Apart, ...]:
+    """Rows with the faces that kept the links apart before they met; one row a face and phase."""
+    out: dict[tuple, Apart] = {}
+    for x in rows:
+        pair = x.before or x.pair
+        y = out.get((x.phase, pair.key), x)
+        ends = min(x.first, y.first), max(x.last, y.last)
+        out[x.phase, pair.key] = Apart(x.phase, *ends, pair, before=x.before)
+    return tuple(out.values())
+
+
 def _distance(body: Body, number: int, q: np.ndarray) -> float:
     """Distance of two links, by the number of their pair, in a configuration (nq,) [m]; negative if
     they meet.

@@ -22,7 +22,7 @@ from jumplab.ocp.solution import PhaseSolution, resampled
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body.apart import MORE_M, merged, runs, too_close
+from jumplab.stages.whole_body.apart import MORE_M, as_before, merged, runs, too_close
 from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.coordinates import KINDS, Coordinates
@@ -243,8 +243,8 @@ class Program(Shown):
                 ways.insert(0 if more else len(ways), (STILL, unpassed(self, asked, rows)))
             if self.sought and number == 0:  # what is largest without them may be far off
                 first = start.begin(self, asked)
-                kept = [replace(x, pair=x.before or x.pair, more_m=0.0) for x in rows]
-                ways.insert(0, (start, replace(first, apart=merged(first.apart, kept))))
+                kept = merged(first.apart, as_before(rows))
+                ways.insert(0, (start, replace(first, apart=kept)))
             solved, way = self._first(asked, ways)
             held = held and way.held
             sides = sides and way is not STILL

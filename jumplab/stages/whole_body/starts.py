@@ -12,6 +12,7 @@ import numpy as np
 
 from jumplab.ocp.nlp import RESIDUAL_LIMIT, WARM, warm
 from jumplab.ocp.solution import Multipliers, PhaseGuess
+from jumplab.stages.whole_body.apart import as_before
 from jumplab.stages.whole_body.motions import Motion, guess, mended, ramped, reached, still
 from jumplab.stages.whole_body.shapes import Apart
 
@@ -197,8 +198,7 @@ def unpassed(program: Program, asked: Asked, rows: Sequence[Apart]) -> Beginning
     """The stance, carried along the schedule, with links that met (``rows``) kept where they were
     before they did: an arm that cannot swing past a thigh stays behind it.
     """
-    kept = tuple(replace(x, pair=x.before or x.pair, more_m=0.0) for x in rows)
-    return replace(from_stance(program, asked), apart=kept)
+    return replace(from_stance(program, asked), apart=as_before(rows))
 
 
 NEIGHBOUR = "neighbour"
