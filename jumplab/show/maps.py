@@ -33,6 +33,8 @@ AXIS_WORDS = {
     "yaw_rad": "turn [rad]",
 }
 
+MORE_COLORS = "#8C564B", "#5E3C99"  # brown and purple, of which that sequence has none
+
 
 @themed
 def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
@@ -45,11 +47,9 @@ def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
     across, up = (AXIS_WORDS[name] for name in envelope.axes)
     cells = [cell for each in maps for cell in each.cells]
     limiting = {cell.limiting for cell in cells}
-    palette = matplotlib.color_sequences["okabe_ito"]
-    colors = {
-        name: palette[(i + 1) % len(palette)]
-        for i, name in enumerate(sorted({cell.limiting for cell in cells if cell.solved}))
-    }
+    names = sorted({cell.limiting for cell in cells if cell.solved})
+    palette = [*matplotlib.color_sequences["okabe_ito"], *MORE_COLORS]
+    colors = {name: palette[(i + 1) % len(palette)] for i, name in enumerate(names)}
     entries = colors | {words: x for kind, (x, words) in REFUSED.items() if kind in limiting}
     handles = [Patch(color=color, label=label) for label, color in entries.items()]
     if others:

@@ -26,7 +26,8 @@ from paper.humanoids import SHARES, leg_m
 
 LOG = Path(__file__).with_name("shipped.jsonl")
 FAR, HIGH = (0.0, 0.25, 0.5, 0.75, 1.0), (0.1, 0.2, 0.3, 0.4, 0.5)  # of the map, in lengths of the leg
-WAISTS = "waist", "torso"  # in names of joints
+# of joints that a map names: what robots share -> in their files' names
+SHARED = {"waist": ("waist", "torso"), "hip roll": (" hr ",), "arm": (" arm ",)}
 LESS = (1.0, 0.75, 0.5, 0.25)  # of SHARES, the first that is clean and stands in every engine
 
 
@@ -82,9 +83,9 @@ def mapped(row: Mapping[str, Any]) -> Envelope:
 
 
 def _same(limit: str) -> str:
-    """A limit in words that robots share, whatever their files call the joint below the trunk."""
-    waist = any(name in limit.lower() for name in WAISTS)
-    return "waist torque" if waist and limit.endswith("torque") else limit
+    """A limit in words that robots share, whatever their files call the joint."""
+    joint = next((joint for joint, names in SHARED.items() if any(x in f" {limit.lower()}" for x in names)), None)
+    return f"{joint} torque" if joint and limit.endswith("torque") else limit
 
 
 def verdicts() -> list[dict[str, Any]]:
