@@ -28,12 +28,14 @@ from fixtures_robots import (
 from jumplab.auditing.audit import audit
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet, posed
 from jumplab.robot.files import read_toml
-from jumplab.robot.stance import stance_angles
+from jumplab.robot.stance import stance_angles, stance_configuration
 from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.sim import INSTALLED, Scene, engine_class, simulate_jump
 from jumplab.stages.planner import Planner
+from jumplab.stages.whole_body import Limits
 from jumplab.task import JumpTask
 
 
@@ -159,10 +161,21 @@ def test_motors_that_cannot_hold_the_stance_are_refused_with_the_file(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", INSTALLED)
 def test_weak_ankles_jump_and_stand(tmp_path, engine):
+    """With a planned landing and with spring-dampers; feet come down for where the CoM will stand above them."""
     robot = load(tmp_path, long_toes)
     plan = Planner(robot).plan(JumpTask(0.2, 0.1))
-    assert audit(plan.tape, plan.robot, plan.task).passed
-    assert simulate_jump(plan.tape, robot, engine=engine).landed
+    tape = plan.tape
+    assert audit(tape, plan.robot, plan.task).passed
+    model, data = robot.model, robot.model.createData()
+    stands = pin.centerOfMass(model, data, stance_configuration(robot))[0]  # ahead of the middle of the soles
+    com = pin.centerOfMass(model, data, tape.q[-1], tape.v[-1]).copy()
+    feet = on_feet(robot, robot.foot.center)
+    sole = np.mean([foot.place(posed(model, tape.q[-1])).translation for foot in feet], axis=0)
+    lim = Limits()
+    caught = (sole - com)[0] + stands - lim.capture_offset_m - lim.capture_slope_s * data.vcom[0][0]
+    assert abs(caught) <= lim.capture_window_m + 1e-3 and stands < -0.04
+    for landing in ("planned", "spring"):
+        assert simulate_jump(tape, robot, engine=engine, landing=landing).landed, landing
 
 
 @pytest.mark.slow
