@@ -141,8 +141,8 @@ def weak(role: str, effort: float, name: str = "weak", **values) -> tuple[str, s
 
 
 def long_toes() -> tuple[str, str]:
-    """Ankles that would need 97 % of their torque to hold the CoM above the middle of the soles."""
-    return weak("ankle_pitch", 17.0, "long_toes", heel=-0.04, toe=0.2)
+    """Ankles that would need 118 % of their torque to hold the CoM above the middle of the soles."""
+    return weak("ankle_pitch", 14.0, "long_toes", heel=-0.04, toe=0.2)
 
 
 def test_motors_that_cannot_hold_the_stance_are_refused_with_the_file(tmp_path):
