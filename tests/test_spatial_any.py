@@ -257,9 +257,10 @@ def test_what_cannot_hold_its_own_weight_is_refused_before_any_solve(robot):
     for _ in range(20):  # forces on the corners that balance the robot
         given = linprog(rng.normal(size=24), **how)
         assert given.success and np.max(np.abs(weight[6:] - pushes[6:] @ given.x) / effort) >= share - 1e-9
+    # more than 1 / 0.9: with ankles so weak it stands nearer to them, where hips bear more
     weak = robot.with_limits(effort=0.9 * share)
     with pytest.raises(
-        InfeasibleError, match=r"^robot wide cannot hold the posture in which it begins: .* needs 1\.\d times its"
+        InfeasibleError, match=r"^robot wide cannot hold the posture in which it begins: .* needs 1\.2 times its"
     ):
         jl.Planner(weak).plan(jl.JumpTask(0.3, 0.2))
 

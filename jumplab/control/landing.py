@@ -151,10 +151,11 @@ class LandingController:
         self._rest_push: np.ndarray | float = 0.0
         self._rest_pitch = float(robot.stance["trunk_pitch_rad"])
         gauge = Gauge(robot)
+        soles = gauge.points(rest, robot.foot.center)
         # of the CoM from the middle of the soles, ahead and up
-        self._above = gauge.com(rest) - gauge.points(rest, robot.foot.center).mean(axis=0)
+        self._above = gauge.com(rest) - soles.mean(axis=0)
         self._leg_m = leg_length(robot)
-        left, right = gauge.points(rest, robot.foot.center)[:, :2]
+        left, right = soles[:, :2]
         self._apart_m = float(np.linalg.norm(left - right))
         self.reference = reference
 

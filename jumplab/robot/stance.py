@@ -35,15 +35,13 @@ def standing_ahead_m(robot: Robot) -> float:
     """By how much the CoM stands ahead of the middle of the soles [m]: 0, but where ankles would
     need more than :data:`ANKLE_SHARE` of their torque; then as near to it as that allows.
     """
-    data = posed(robot.model)
-    feet = on_feet(robot, robot.foot.center)
-    sides = zip(feet, robot.joints["ankle_pitch"], strict=True)
-    ahead = []
-    for foot, name in sides:
-        ankle = data.oMi[robot.model.getJointId(name)].translation
-        ahead.append(foot.place(data).actInv(ankle)[0])
-    ankle_m = float(np.mean(ahead))
-    effort = sum(robot.actuators[name]["effort"] for name in robot.joints["ankle_pitch"])
+    model = robot.model
+    data = posed(model)
+    names = robot.joints["ankle_pitch"]
+    ankles = [data.oMi[model.getJointId(name)].translation for name in names]
+    sides = zip(on_feet(robot, robot.foot.center), ankles, strict=True)
+    ankle_m = np.mean([foot.place(data).actInv(ankle)[0] for foot, ankle in sides])
+    effort = sum(robot.actuators[name]["effort"] for name in names)
     way = ANKLE_SHARE * effort / (robot.total_mass * GRAVITY)
     inside = WITHIN_SHARE * (robot.foot.toe - robot.foot.heel) / 2
     return float(np.clip(np.clip(0.0, ankle_m - way, ankle_m + way), -inside, inside))

@@ -162,8 +162,7 @@ def landing_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term
         speed = ca.polyval(ca.DM(envelope.speed_fit), p.q[1])
         return ca.vertcat(speed - p.v[1], speed + p.v[1])
 
-    lean, length, *_ = envelope.start
-    ahead = length * np.sin(lean)
+    ahead = envelope.start[1] * np.sin(envelope.start[0])  # of the CoM at rest
 
     def cop(p):
         return -p.pivot_torque / (mass * p.p.gravity) - ahead

@@ -275,8 +275,7 @@ class Schedule:
                 out[f"{SIDES[side]}_{x}"] = (low, high, 1.0, f"contact {contact} {x}")
         for name in self.sought:
             # the largest one lies ahead, and a solver that steps over 0 may stay there
-            low, high = (max(0.0, end) for end in RANGES[SOUGHT[name]][1:])
-            ends = (partial(_furthest, name, end) for end in (low, high))
+            ends = (partial(_furthest, name, max(0.0, x)) for x in RANGES[SOUGHT[name]][1:])
             out[name] = (*ends, 1.0, f"target {name}")
         return out
 
